@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 
 .PHONY: quickstart test test-fast test-slow test-latest-sbi lint types size
-.PHONY: docs docs-code docs-site docs-links format clean tasks package
+.PHONY: docs docs-code docs-site docs-links format clean package
 .PHONY: examples example-quickstart example-tunnel example-tasks example-people
 
 quickstart: $(VENV)/.installed
@@ -81,10 +81,6 @@ example-tasks: $(VENV)/.installed
 example-people: $(VENV)/.installed
 	$(EXAMPLE)/hemodynamics.py --rounds 2 --max-num-epochs 2 \
 	    $(REDUCED) --n-test 30 --out $(OUT)/hemodynamics
-
-# What the command that lists the tasks measures holds for one thread.
-tasks: $(VENV)/.installed
-	OMP_NUM_THREADS=1 $(BIN)/python -m sbi_rope.tasks
 
 package: $(VENV)/.installed
 	PYTHON=$(PYTHON) OMP_NUM_THREADS=1 .ci/package

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from sbi_rope._prior import PriorDistribution
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import TrainedNPE, embed
@@ -17,6 +18,7 @@ from sbi_rope.coupling import Coupling, SinkhornCoupler
 from sbi_rope.data import Counts, Pairs
 from sbi_rope.density import Coupled, MixturePosterior
 from sbi_rope.discrepancy.correction import tuning_targets
+from sbi_rope.discrepancy.parameters import is_improbable, probability_of_prior
 from sbi_rope.errors import (
     CouplingError,
     InvalidInputError,
@@ -199,6 +201,7 @@ class RoPE:
         self._pairs = Pairs.exact(self._npe.like, x)
         self._names: tuple[Hashable, ...] = ()
         self._g: nn.Module | None = None
+        self._prior_is_compared = False
         self._history: History | None = None
 
     def append_calibration(
@@ -310,6 +313,7 @@ class RoPE:
         self._pairs, self._names = pairs, of_rows
         self._npe.parameter_names, self._npe.x_names = names, x_names
         self._g, self._history = None, None
+        self._prior_is_compared = False
         return self
 
     def train(
@@ -482,6 +486,7 @@ class RoPE:
             show_progress_bars=show_progress_bars,
         )
         warn_of_far_entries("x_o", batch.x_o, self._npe.h)
+        self._warn_of_prior(coupler.tau)
         coupling = batch.couple(coupler)
         if require_convergence and not coupling.converged:
             raise CouplingError(
@@ -491,6 +496,19 @@ class RoPE:
                 "more max_iterations, or require_convergence=False."
             )
         return batch.posterior(coupling, unseen=unseen)
+
+    def _warn_of_prior(self, tau: float) -> None:
+        """Warn once if a batch is spread over a prior that the labels do not follow."""
+        if self._prior_is_compared or tau < 1 or not len(self._pairs):
+            return
+        self._prior_is_compared = True
+        prior = PriorDistribution(self._npe.prior)
+        if is_improbable(found := probability_of_prior(self._pairs, prior)):
+            warn_user(
+                "The labels are not distributed like the prior (probability that they "
+                f"are: {found:.1g}), over which tau=1 spreads the batch. Use a smaller "
+                "tau, or `stack`."
+            )
 
     def tuned_posterior(self) -> Any:
         r"""Return the flow on the tuned embedding, :math:`q(\theta \mid g(x))`.

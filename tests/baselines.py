@@ -34,6 +34,7 @@ from sbi_rope.baselines import (
     PlainNPE,
     PriorBaseline,
     ReferenceNPE,
+    Regression,
     Training,
     TuningOnly,
 )
@@ -92,6 +93,7 @@ METHODS: dict[str, Entry] = {
     ),
     "joint_npe": Entry(JointNPE, lambda task: {"training": SHORT}),
     "calibration_mlp": Entry(CalibrationMLP, lambda task: {"training": SHORT}),
+    "regression": Entry(Regression),
     "finetuned_npe": Entry(FinetunedNPE, lambda task: BRIEF),
     "finetuned_npe_averaged": Entry(
         FinetunedNPE, lambda task: {**BRIEF, "num_holdouts": 3}

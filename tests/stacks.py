@@ -54,6 +54,9 @@ def quick() -> Iterator[None]:
         ),
         "sbi_rope.discrepancy.correction.NUM_DRAWS": 50,
         "sbi_rope.discrepancy.correction.NUM_COMPARED": 50,
+        "sbi_rope.discrepancy.unlabelled.SEARCH": Training(max_num_epochs=5),
+        "sbi_rope.discrepancy.unlabelled.NUM_HESSIANS": 1,
+        "sbi_rope.discrepancy.unlabelled.NUM_COMPONENTS": 5,
         "sbi_rope.fit.MAX_LOWERED": 0,
     }
     with ExitStack() as patches:

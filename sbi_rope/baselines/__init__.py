@@ -13,6 +13,7 @@ from sbi_rope.baselines.joint_npe import JointNPE
 from sbi_rope.baselines.nnpe import NNPE
 from sbi_rope.baselines.npe import PlainNPE, PriorBaseline, ReferenceNPE
 from sbi_rope.baselines.npe_rs import NPERS
+from sbi_rope.baselines.regression import Regression
 from sbi_rope.baselines.rnpe import RNPE
 from sbi_rope.baselines.rope_parts import OTOnly, TuningOnly
 from sbi_rope.baselines.rvnp import RVNP
@@ -36,6 +37,7 @@ __all__ = [
     "PriorBaseline",
     "PriorPosterior",
     "ReferenceNPE",
+    "Regression",
     "SpikeAndSlab",
     "Training",
     "TuningOnly",

@@ -5,11 +5,13 @@ from sbi_rope.density.coupled import Coupled, OverSimulations
 from sbi_rope.density.flow import Flow
 from sbi_rope.density.mixture import Mixture, average, density_of
 from sbi_rope.density.posterior import MixturePosterior, PriorPosterior
+from sbi_rope.density.regression import GaussianProcess
 
 __all__ = [
     "Coupled",
     "Density",
     "Flow",
+    "GaussianProcess",
     "Given",
     "Mixture",
     "MixturePosterior",

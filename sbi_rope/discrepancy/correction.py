@@ -20,6 +20,7 @@ from sbi_rope.discrepancy.posterior import (
     noise_scale,
 )
 from sbi_rope.discrepancy.regression import SMALLEST_NOISE
+from sbi_rope.discrepancy.unlabelled import LaplaceDiscrepancy
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.fit import Courses, History, Training, fit
 from sbi_rope.simulate import Moments
@@ -29,6 +30,7 @@ __all__ = [
     "Space",
     "correct_flow",
     "fit_discrepancy",
+    "in_units",
     "network_of",
     "surprise",
     "tuning_targets",
@@ -68,6 +70,7 @@ NUM_COMPARED = 1920
 # benchmarks/choices.md.
 COURSES = Courses(min_gain=0.01)
 IN_A_STACK = Courses(min_gain=0.01, min_fall=0.3, max_num=2, growth=4)
+IN_A_STACK_OF_INPUT = replace(IN_A_STACK, growth=2)
 IN_A_STACK_WITHOUT_NET = replace(IN_A_STACK, max_num=1)
 
 
@@ -123,20 +126,28 @@ def fit_discrepancy(
     ``standardisation`` is that of z over simulations from the prior. Weights and groups
     are those of :meth:`DiscrepancyModel.fit`.
     """
-    varies = standardisation.varies
-    if not varies.any():
+    if not standardisation.varies.any():
         raise InvalidInputError(
             "Expected simulations that differ from each other; got the same embedding "
             "(or the same x) for all of them."
         )
-    std = standardisation.std[varies]
-    covariances = moments.covariance[:, varies][:, :, varies] / std / std[:, None]
-    z, means = standardisation(z.double()), standardisation(moments.means)
-    covariance = covariances.mean(dim=0)
+    z, unit = standardisation(z.double()), in_units(moments, standardisation)
+    means, covariances = unit.means, unit.covariance
     found = surprise(z, means, covariances, weights=weights, groups=groups)
     if found > LARGEST_SURPRISE and model.probability_of_none < 1.0:
         model = replace(model, probability_of_none=0.0)
+    covariance = covariances.mean(dim=0)
     return model.fit(z, means, covariance, weights=weights, groups=groups)
+
+
+def in_units(moments: Moments, standardisation: Standardisation) -> Moments:
+    """Return moments of the entries that vary, in their standard deviations."""
+    varies = standardisation.varies
+    std = standardisation.std[varies]
+    return Moments(
+        means=standardisation(moments.means),
+        covariance=moments.covariance[:, varies][:, :, varies] / std / std[:, None],
+    )
 
 
 def tuning_targets(
@@ -211,7 +222,7 @@ def surprise(
 def correct_flow(
     estimator: ConditionalEstimator,
     simulations: tuple[Tensor, Tensor],
-    discrepancies: Sequence[Discrepancy],
+    discrepancies: Sequence[Discrepancy | LaplaceDiscrepancy],
     *,
     space: Space,
     probabilities: Sequence[Tensor | None],
@@ -286,8 +297,9 @@ def correct_flow(
     training = TRAINING[space]
     courses = Courses(math.inf) if num_steps else COURSES
     if in_a_stack:
-        longer = has_parameters(embedding_of(estimator))
-        courses = IN_A_STACK if longer else IN_A_STACK_WITHOUT_NET
+        courses = IN_A_STACK_OF_INPUT if space == "input" else IN_A_STACK
+        if not has_parameters(embedding_of(estimator)):
+            courses = IN_A_STACK_WITHOUT_NET
     histories = fit(
         network,
         lambda step: [batch(training.training_batch_size)],

@@ -82,7 +82,8 @@ class DiscrepancyNPE(Method):
         space: What is corrected, see above.
         learn_prior: Whether to learn the distribution of real parameters from those of
             the pairs, see :func:`~sbi_rope.discrepancy.learn_parameters`. The pairs
-            must then be drawn like the observations to be inferred.
+            must then be drawn like the observations to be inferred. Otherwise, pass
+            False.
         model: The model of the discrepancy; ``DiscrepancyModel()`` if None.
         num_simulations: Simulations from the prior to train on, if none were appended.
         num_steps: Gradient steps. If None, NPE is trained in courses of 200 steps (400
@@ -104,7 +105,7 @@ class DiscrepancyNPE(Method):
         *,
         simulator: Callable[[Any], Any] | None = None,
         space: Space = "embedding",
-        learn_prior: bool = False,
+        learn_prior: bool = True,
         model: DiscrepancyModel | None = None,
         num_simulations: int = 20_000,
         num_steps: int | None = None,

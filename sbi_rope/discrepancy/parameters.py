@@ -6,11 +6,21 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
-from torch.distributions import MultivariateNormal
+from torch.distributions import Distribution, MultivariateNormal
 
+from sbi_rope._random import seeded
+from sbi_rope.data import Pairs
 from sbi_rope.tensors import as_batch
 
-__all__ = ["ParameterDistribution", "is_improbable", "learn_parameters"]
+__all__ = [
+    "ParameterDistribution",
+    "is_improbable",
+    "learn_parameters",
+    "probability_of_prior",
+]
+
+# Draws of the prior that the parameters of pairs are compared with.
+NUM_FROM_PRIOR = 10_000
 
 # Draws of each label that is not exact.
 NUM_SETS = 10
@@ -99,6 +109,14 @@ def learn_parameters(
         probabilities=torch.stack([part.probabilities for part in parts]).mean(dim=0),
         probability_of_prior=sum(of_prior) / len(of_prior),
     )
+
+
+def probability_of_prior(pairs: Pairs, prior: Distribution, *, seed: int = 0) -> float:
+    """Return the probability that the parameters of pairs follow the prior."""
+    with seeded(seed):
+        theta = prior.sample(torch.Size((NUM_FROM_PRIOR,)))
+    theta, weights = theta.to(pairs.theta), pairs.counts.weights
+    return learn_parameters(pairs.theta, theta, weights=weights).probability_of_prior
 
 
 def _is_discrete(column: Tensor) -> bool:

@@ -21,13 +21,12 @@ SMALLEST_SCALE = 0.01
 def noise_scale(covariance: Tensor) -> Tensor:
     """Return the diagonal of D: the noise of each entry, relative to the largest.
 
-    The covariance is that of simulations at one parameter, ``(l, l)``. D is one if
-    there is no noise at all.
+    The covariance is that of simulations at one parameter, ``(*batch, l, l)``. D is
+    one if there is no noise at all.
     """
-    std = covariance.diagonal().clamp_min(0.0).sqrt()
-    if not std.max() > 0:
-        return torch.ones_like(std)
-    return (std / std.max()).clamp_min(SMALLEST_SCALE)
+    std = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
+    largest = std.amax(dim=-1, keepdim=True)
+    return torch.where(largest > 0, std / largest, 1.0).clamp_min(SMALLEST_SCALE)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -7,7 +7,7 @@ from sbi_rope.stacking.candidates import (
     GivenCandidate,
     NPECandidate,
     PriorCandidate,
-    RVNPCandidate,
+    UnlabelledCandidate,
     default_candidates,
 )
 from sbi_rope.stacking.cross_validation import (
@@ -33,12 +33,12 @@ __all__ = [
     "LearningCurve",
     "NPECandidate",
     "PriorCandidate",
-    "RVNPCandidate",
     "SetScores",
     "StackData",
     "StackedPosterior",
     "StackingReport",
     "StackingWeights",
+    "UnlabelledCandidate",
     "default_candidates",
     "stack",
     "stacking_weights",

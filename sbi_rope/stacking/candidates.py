@@ -12,16 +12,23 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from sbi_rope._sbi import NeuralPosterior, embed, estimator_of
+from sbi_rope._sbi import (
+    MixedDensity,
+    NeuralPosterior,
+    embed,
+    has_parameters,
+)
 from sbi_rope._standardisation import Standardisation
-from sbi_rope.density import Density, Flow, Given, Prior, density_of
+from sbi_rope.density import Density, Flow, GaussianProcess, Given, Prior, density_of
 from sbi_rope.discrepancy.correction import (
     Correction,
     Space,
     correct_flow,
     fit_discrepancy,
+    in_units,
     network_of,
 )
+from sbi_rope.discrepancy.unlabelled import Marginal, fit_unlabelled
 from sbi_rope.ensemble import Ensemble
 from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError, warn_user
 from sbi_rope.finetuning import FINETUNING, TUNING, finetune_flow
@@ -36,9 +43,11 @@ __all__ = [
     "DiscrepancyCandidate",
     "FinetunedCandidate",
     "GivenCandidate",
-    "RVNPCandidate",
+    "RegressionCandidate",
+    "UnlabelledCandidate",
     "chosen_candidates",
     "default_candidates",
+    "left_out",
     "suitable_candidates",
 ]
 
@@ -52,11 +61,13 @@ class Candidate(ABC):
             that of the candidate if it has none.
         learns_prior: Whether it learns from the pairs how parameters are distributed,
             as all training on them does.
+        needs: What the data need for it, for the report of a stack that leaves it out.
     """
 
     name: str
     family: str = ""
     learns_prior: bool = True
+    needs: str = ""
 
     def suits(self, data: StackData) -> bool:
         """Tell whether the data allow it. The default stack leaves it out if not."""
@@ -164,6 +175,14 @@ def as_density(own: Any, data: StackData, name: str) -> Density:
     return own
 
 
+# What the data need for a correction, in words.
+NEEDS: dict[Space, str] = {
+    "embedding": "",
+    "input": "short x without NaN, and an embedding net",
+    "tuned": "long x, 3 folds",
+}
+
+
 @dataclass(frozen=True, kw_only=True)
 class DiscrepancyCandidate(Settings, Candidate):
     """NPE trained on corrected simulations, as learned from the pairs.
@@ -181,6 +200,11 @@ class DiscrepancyCandidate(Settings, Candidate):
     space: Space = "embedding"
     learn_prior: bool = True
     family = "discrepancy"
+
+    @property
+    def needs(self) -> str:  # type: ignore[override]
+        """What the data need for it."""
+        return NEEDS[self.space]
 
     @property
     def name(self) -> str:  # type: ignore[override]
@@ -366,6 +390,14 @@ class FinetunedCandidate(Settings, Candidate):
         """The method that it is a setting of."""
         return "fine-tuned NPE" if self.space is None else "discrepancy, fine-tuned"
 
+    @property
+    def needs(self) -> str:  # type: ignore[override]
+        """What the data need for it."""
+        needs = f"{MIN_TO_REHEARSE} pairs, long x" if self.rehearse else "3 folds"
+        if self.space is not None:
+            needs = "long x" if self.space == "embedding" else NEEDS[self.space]
+        return needs
+
     def suits(self, data: StackData) -> bool:
         """Tell whether there are parts to hold out, and the starting NPE applies.
 
@@ -437,85 +469,134 @@ class FinetunedCandidate(Settings, Candidate):
         ]
 
 
-# With fewer observations, or with more statistics, the default stack does without it.
-# One of thousands of steps takes .05 s with 6 statistics, .4 s with 20 and 3 s with 50.
-MIN_OBSERVATIONS, MAX_STATISTICS = 100, 20
-# Training takes longer with every observation. None of these was tuned.
-MAX_OBSERVATIONS = 1000
+# With fewer pairs the candidate is left out.
+MIN_TO_REGRESS = 10
 
 
-@dataclass(frozen=True, eq=False)
-class RVNPCandidate(Candidate):
-    """NPE with an error model that is learned from observations without labels.
+@dataclass(frozen=True, kw_only=True)
+class RegressionCandidate(Settings, Candidate):
+    """A Gaussian process of the labels, which needs no simulator.
 
-    See :class:`~sbi_rope.baselines.RVNP`. It is trained once, because it does not see
-    the labels of the pairs, which only decide about its weight.
+    See :class:`~sbi_rope.density.GaussianProcess`.
 
     Args:
-        x_o: Real observations, shape ``(n_o, *event)``. The stack may be asked about
-            these or about others. The observations of the calibration pairs should
-            not be among them, so that the scores are those of new observations. If
-            there are more than 1000, a thousand of them are drawn.
-        space: What the errors are in: the ``"embedding"`` h(x), or the ``"input"`` x,
-            whose shape must be ``(l,)`` then. The default stack has the latter if x
-            is a short vector and NPE has an embedding net. Training takes minutes
-            with a few statistics, and hours with fifty.
-
-    Raises:
-        InvalidInputError: If x_o holds no numbers, or ``space`` is something else.
-            Shape and values of x_o are checked when the stack is made.
+        space: What it depends on: x itself, with ``"input"``, or the embedding h(x).
     """
 
-    x_o: Tensor = field(repr=False)
-    space: Literal["embedding", "input"] = field(default="embedding", kw_only=True)
-    family = "RVNP"
-    learns_prior = False
-
-    def __post_init__(self) -> None:
-        """Check the space, and take a copy of the observations."""
-        check("space", self.space, Literal["embedding", "input"])
-        object.__setattr__(self, "x_o", as_numbers("x_o", self.x_o).clone())
+    space: Literal["embedding", "input"] = "input"
+    family = "regression"
+    needs = f"{MIN_TO_REGRESS} exact labels of continuous parameters, no NaN"
 
     @property
     def name(self) -> str:  # type: ignore[override]
         """The name of the method and its setting."""
-        return "RVNP" if self.space == "embedding" else "RVNP (input)"
+        return "regression" + (" (embedding)" if self.space == "embedding" else "")
 
     def suits(self, data: StackData) -> bool:
-        """Tell whether there are enough observations of a few statistics."""
-        if len(self.x_o) < MIN_OBSERVATIONS:
+        """Tell whether there are ten exact labels of continuous parameters, and no NaN.
+
+        Without an embedding net, h(x) is x.
+        """
+        if self.space == "embedding" and not has_parameters(data.embedding_net):
             return False
-        reads_x = data.reads_summaries and bool(torch.isfinite(self.x_o).all())
-        if self.space != ("input" if reads_x else "embedding"):
-            return False
-        statistics = data.simulations[1] if reads_x else data.embedded
-        varies = bool((statistics != statistics[0]).any())
-        return varies and statistics.shape[1] <= MAX_STATISTICS
+        theta, pairs = data.pairs.mean, data.pairs
+        return (
+            pairs.num_groups >= MIN_TO_REGRESS
+            and pairs.are_exact
+            and bool((theta != theta[0]).any(dim=0).all())
+            and bool(torch.isfinite(pairs.x).all())
+            and not any(isinstance(m, MixedDensity) for m in data.estimator.modules())
+        )
+
+    def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
+        """Fit a process to each version of the pairs."""
+        net = data.embedding_net if self.space == "embedding" else None
+        pairs = data.pairs
+        return [
+            GaussianProcess(
+                pairs.mean[rows],
+                pairs.x[rows],
+                weights=pairs.counts.weights[rows],
+                groups=pairs.group[rows],
+                net=net,
+            )
+            for rows in versions
+        ]
+
+
+# Observations without labels that the candidate needs, and those that it takes: more
+# add nothing. With more entries of x, its search takes long.
+MIN_OBSERVATIONS, MAX_OBSERVATIONS, MAX_ENTRIES = 30, 200, 10
+
+
+@dataclass(frozen=True, eq=False)
+class UnlabelledCandidate(Candidate):
+    """NPE trained on corrected simulations, as learned from unlabelled x, too.
+
+    See :func:`~sbi_rope.discrepancy.unlabelled.fit_unlabelled`. It assumes that the
+    parameters of the observations follow the prior. The labels decide about its weight.
+
+    Args:
+        x_o: Real observations, shape ``(n_o, l)``. The stack may be asked about these
+            or about others. The observations of the calibration pairs should not be
+            among them, so that the scores are those of new observations. If there are
+            more than 200, so many are drawn.
+
+    Raises:
+        InvalidInputError: If x_o holds no numbers. Shape and values of x_o are checked
+            when the stack is made.
+    """
+
+    x_o: Tensor = field(repr=False)
+    name = "discrepancy, with x_o"
+    learns_prior = False
+    needs = f"{MIN_OBSERVATIONS} observations of {MAX_ENTRIES} numbers, exact labels"
+
+    def __post_init__(self) -> None:
+        """Take a copy of the observations."""
+        object.__setattr__(self, "x_o", as_numbers("x_o", self.x_o).clone())
+
+    def suits(self, data: StackData) -> bool:
+        """Tell whether there are enough observations, of few entries."""
+        return (
+            len(self.x_o) >= MIN_OBSERVATIONS
+            and data.pairs.are_exact
+            and data.compares_entries
+            and data.pairs.x.shape[1] <= MAX_ENTRIES
+            and bool(torch.isfinite(self.x_o).all())
+        )
 
     def check(self, data: StackData) -> None:
         """Raise for observations of another shape, and those that are not finite."""
-        x_o = data.rope.checked_observations(self.x_o)
-        if self.space == "input":
-            _check_space(data, "input")
-            as_batch("x_o", x_o)
+        as_batch("x_o", data.rope.checked_observations(self.x_o))
+        _check_space(data, "input")
 
     def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
-        """Train errors and posterior on the observations, once for all versions."""
-        if self not in data.kept:
-            data.kept[self] = self._trained(data)
-        return [data.kept[self]] * len(versions)
-
-    def _trained(self, data: StackData) -> Flow:
-        # Importing the package does not load the baselines.
-        from sbi_rope.baselines.rvnp import RVNP
-
-        method = RVNP.from_posterior(data.npe, noise_on=self.space)
-        x_o = self.x_o
-        if len(x_o) > MAX_OBSERVATIONS:
-            x_o = x_o[torch.randperm(len(x_o))[:MAX_OBSERVATIONS]]
-        method.append_observations(x_o).append_simulations(*data.simulations)
-        method.train(show_progress_bars=data.show)
-        return Flow.of([estimator_of(method.build_posterior())])
+        """Train NPE on corrected simulations."""
+        theta_s, x_s = data.simulations
+        unit = Standardisation(x_s.double())
+        chosen = torch.randperm(len(self.x_o))[:MAX_OBSERVATIONS]
+        rows = torch.cat(list(versions)).unique()
+        weight = data.pairs.counts.weights[rows]
+        is_seen = torch.stack([torch.isin(rows, seen) for seen in versions])
+        discrepancies = fit_unlabelled(
+            unit(data.pairs.x[rows].double()),
+            in_units(data.moments(rows, "input"), unit),
+            weight.where(is_seen, 0.0).double(),
+            unit(self.x_o[chosen].to(x_s).double()),
+            Marginal.of(unit(x_s.double())),
+            show_progress_bars=data.show,
+        )
+        flow = correct_flow(
+            data.estimator,
+            (theta_s, x_s),
+            discrepancies,
+            space="input",
+            probabilities=[None] * len(versions),
+            in_a_stack=True,
+            show_progress_bars=data.show,
+        ).flow
+        return [flow[[version]] for version in range(len(versions))]
 
 
 def default_candidates(
@@ -524,19 +605,18 @@ def default_candidates(
     *,
     learn_prior: bool = True,
 ) -> tuple[Candidate, ...]:
-    """Return the prior, NPE, fine-tuned NPE, discrepancy models, and RVNP with x_o.
+    """Return the prior, NPE, fine-tuned NPE, discrepancy models, and regressions.
 
     NPE is fine-tuned on the pairs alone, and from discrepancy models, and on pairs and
-    simulations together.
+    simulations together. Regressions do without the simulator.
 
     Args:
         rope: A RoPE with its calibration pairs. Candidates that these data do not
             allow or need are left out, as in :func:`stack`. None returns all.
         x_o: Real observations without labels, shape ``(n_o, *event)``, other than those
-            of the pairs. They add RVNP, which learns errors from them. With a rope, it
-            is left out if there are fewer than a hundred observations, or more than 20
-            statistics: these are x if it is a short vector and NPE has an embedding
-            net, and the embedding otherwise.
+            of the pairs. They add a discrepancy that is learned from them, too. With a
+            rope, it is left out if there are fewer than 30, x is no vector of at most
+            ten entries, or labels are not exact.
         learn_prior: Whether candidates may learn from the pairs how parameters are
             distributed. They should if the pairs are drawn like the observations to be
             inferred. With False, discrepancy models keep the prior of NPE.
@@ -565,12 +645,26 @@ def suitable_candidates(
         for candidate in _all_candidates(x_o, learn_prior=learn_prior)
         if candidate.suits(data)
     )
-    if x_o is not None and not any(isinstance(one, RVNPCandidate) for one in chosen):
+    if x_o is not None and not any(
+        isinstance(one, UnlabelledCandidate) for one in chosen
+    ):
         warn_user(
-            f"`x_o` adds no candidate: RVNP needs {MIN_OBSERVATIONS} observations of "
-            f"at most {MAX_STATISTICS} statistics that vary; got {len(x_o)}."
+            f"`x_o` adds no candidate, which takes {MIN_OBSERVATIONS} observations of "
+            f"at most {MAX_ENTRIES} numbers, and exact labels; got {len(x_o)} of shape "
+            f"{tuple(x_o.shape[1:])}. It is compared with the pairs."
         )
     return chosen
+
+
+def left_out(candidates: Sequence[Candidate], x_o: Tensor | None) -> str:
+    """Return which default candidates are not among some, and what they need."""
+    names = {candidate.name for candidate in candidates}
+    missing = [
+        f"{one.name} (needs {one.needs})"
+        for one in _all_candidates(x_o, learn_prior=True)
+        if one.name not in names
+    ]
+    return "; ".join(missing)
 
 
 def _all_candidates(x_o: Tensor | None, *, learn_prior: bool) -> tuple[Candidate, ...]:
@@ -585,11 +679,13 @@ def _all_candidates(x_o: Tensor | None, *, learn_prior: bool) -> tuple[Candidate
         FinetunedCandidate(space="input"),
         FinetunedCandidate(space="tuned"),
         FinetunedCandidate(rehearse=True),
+        RegressionCandidate(),
+        RegressionCandidate(space="embedding"),
     )
     if not learn_prior:
         candidates = tuple(one for one in candidates if not one.learns_prior)
     if x_o is not None:
-        candidates += (RVNPCandidate(x_o), RVNPCandidate(x_o, space="input"))
+        candidates += (UnlabelledCandidate(x_o),)
     return candidates
 
 

@@ -31,8 +31,6 @@ NUM_SIMULATIONS = 10_000
 SIMULATIONS_PER_PAIR = 100
 # A vector x with more entries is not treated as a list of summaries.
 MAX_SUMMARIES = 20
-# Draws of the prior that the parameters of the pairs are compared with.
-NUM_FROM_PRIOR = 10_000
 # Samples of an estimator that is trained on labels that are not exact, and the nodes at
 # which their density is computed.
 NUM_SAMPLES, NUM_NODES = 200, 64
@@ -238,19 +236,6 @@ class StackData:
             self.simulations[0],
             weights=self.pairs.counts.weights[rows],
         ).probabilities
-
-    def probability_of_prior(self) -> float:
-        """Return the probability that the parameters of all pairs follow the prior.
-
-        It needs no simulations, so that a stack without corrections makes none.
-        """
-        with seeded(self.seed):
-            theta = self.prior.sample(torch.Size((NUM_FROM_PRIOR,)))
-        return learn_parameters(
-            self.pairs.theta,
-            theta.to(self.pairs.theta),
-            weights=self.pairs.counts.weights,
-        ).probability_of_prior
 
     @torch.no_grad()
     def nodes(self, rows: Tensor, start: Density) -> Nodes:

@@ -77,8 +77,8 @@ class StackingReport:
         probability_of_prior: The probability that the parameters of the pairs were
             drawn from the prior, see :func:`~sbi_rope.discrepancy.learn_parameters`;
             None if it is not known.
-        learns_prior: Whether a candidate learns from the pairs how parameters are
-            distributed.
+        keep_prior: The names of the candidates that do not learn from the pairs how
+            parameters are distributed.
         parameter_names: One name for each parameter; None if they have none.
     """
 
@@ -99,7 +99,7 @@ class StackingReport:
     discrepancy: DiscrepancyReport | None = None
     provenance: dict[str, str] = field(default_factory=dict, repr=False)
     probability_of_prior: float | None = None
-    learns_prior: bool = True
+    keep_prior: tuple[str, ...] = ()
     parameter_names: tuple[str, ...] | None = None
 
     @classmethod
@@ -144,6 +144,20 @@ class StackingReport:
             by_estimate=_by_estimate(scores),
             **others,
         )
+
+    @property
+    def learns_prior(self) -> bool:
+        """Whether a candidate learns how parameters are distributed."""
+        return len(self.keep_prior) < len(self.cross_validation.names)
+
+    @property
+    def score_of_prior_kept(self) -> float | None:
+        """The best score of a candidate that does not learn the prior; None if none."""
+        scores = self.cross_validation
+        found = [
+            scores.mean_and_error(scores.scores_of(name))[0] for name in self.keep_prior
+        ]
+        return max(found, default=None)
 
     @property
     def levels(self) -> Tensor:

@@ -16,6 +16,7 @@ from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._statistics import TwoSampleTest, compare_with_pairs
 from sbi_rope.density import Density
 from sbi_rope.discrepancy import DiscrepancyReport
+from sbi_rope.discrepancy.parameters import probability_of_prior
 from sbi_rope.errors import warn_user
 from sbi_rope.rope import RoPE
 from sbi_rope.settings import Range, check, default_names
@@ -23,6 +24,7 @@ from sbi_rope.stacking.candidates import (
     Candidate,
     as_densities,
     chosen_candidates,
+    left_out,
 )
 from sbi_rope.stacking.cross_validation import CrossValidation, LearningCurve
 from sbi_rope.stacking.data import NUM_FOLDS, StackData, draw_seeds
@@ -71,13 +73,13 @@ def stack(
             changed, except that it counts calls of the simulator, and the simulations
             that are dropped.
         x_o: Real observations without labels, shape ``(n_o, *event)``, other than those
-            of the pairs. If there are a hundred of at most 20 statistics, the default
-            candidates have RVNP among them, which learns from ``x_o``.
+            of the pairs. If there are 30 vectors of at most ten entries, the default
+            candidates have a discrepancy among them that is learned from them, too.
         candidates: What to stack;
             :func:`default_candidates(rope, x_o)
             <sbi_rope.stacking.default_candidates>` if None: the prior, NPE, fine-tuned
-            NPE and discrepancy models. A posterior, or a density of your own, that has
-            not seen the pairs is taken as it is, see
+            NPE, discrepancy models and regressions. A posterior, or a density of your
+            own, that has not seen the pairs is taken as it is, see
             :class:`~sbi_rope.stacking.GivenCandidate`.
         num_folds: The number of folds, at most the number of groups. Pairs with equal
             labels, or of the same of the ``groups`` that were appended, are in the same
@@ -127,6 +129,7 @@ def stack(
     batch = None if x_o is None else _compare_batch(data, x_o)
     numbers = range(len(data.folds))
     points: list[CrossValidation] = []
+    seconds = dict.fromkeys((candidate.name for candidate in stacked), 0.0)
     fitted: list[list[Density]] = []
     for count in _numbers_of_folds(len(numbers), curve=learning_curve):
         versions = [data.without(k, count) for k in numbers]
@@ -136,8 +139,10 @@ def stack(
         for candidate in stacked:
             # With the same seed for all, nothing depends on the order of candidates.
             # The caller may have switched gradients off.
+            began = time.perf_counter()
             with seeded(data.seed), torch.enable_grad():
                 densities = candidate.fit(data, versions)
+            seconds[candidate.name] += time.perf_counter() - began
             found.append(as_densities(densities, data, candidate.name))
         fitted = fitted or found
         points.append(
@@ -149,12 +154,19 @@ def stack(
         LearningCurve.of(points[::-1]) if learning_curve else None,
         batch=batch,
         discrepancy=_discrepancy(stacked, data),
-        probability_of_prior=data.probability_of_prior(),
-        learns_prior=any(one.learns_prior for one in stacked),
+        probability_of_prior=probability_of_prior(
+            data.pairs, data.prior, seed=data.seed
+        ),
+        keep_prior=tuple(one.name for one in stacked if not one.learns_prior),
         parameter_names=rope.parameter_names,
         provenance={
             "seed": "none, so that a repetition differs" if seed is None else str(seed),
             "seconds": f"{time.perf_counter() - start:.0f}",
+            "longest": ", ".join(
+                f"{name} {seconds[name]:.0f} s"
+                for name in sorted(seconds, key=lambda one: -seconds[one])[:3]
+            ),
+            "left out": left_out(stacked, x_o) if candidates is None else "",
             "simulator calls": f"{rope.num_simulator_calls - calls:,}",
             "finished": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
             "versions": ", ".join(f"{name} {version(name)}" for name in PACKAGES),

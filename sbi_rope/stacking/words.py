@@ -73,8 +73,8 @@ IF_IT_DEPENDS = (
 
 # What follows if the parameters of the pairs do not follow the prior.
 IF_LEARNED = (
-    "The stack has learned where they are. It expects the same of new observations, "
-    "and is too sure about those with other parameters."
+    "The stack expects the same of new observations; for others use "
+    "`candidates=default_candidates(rope, learn_prior=False)`."
 )
 IF_KEPT = (
     "The stack keeps the prior. It may look too wide for such parameters, and its "
@@ -91,8 +91,9 @@ IN_WORDS = {
     "has corrected",
     "discrepancy, fine-tuned": "NPE of simulations that a linear model has corrected, "
     "trained further by the labels",
-    "RVNP": "NPE trained on observations without labels, with errors that are learnt "
-    "from them",
+    "regression": "the labels alone, without the simulator",
+    "discrepancy, with x_o": "NPE of simulations that a linear model has corrected, "
+    "learnt from the labels and from observations without",
 }
 
 
@@ -154,7 +155,10 @@ def _labels(report: "StackingReport") -> list[str]:
 
 
 def _scores(report: "StackingReport") -> list[str]:
-    lines = ["  log score of the stack, in nats a pair (higher is better):"]
+    lines = [
+        "  log score, in nats a pair (higher is better), of models trained without it;",
+        "  their average is deployed, usually a little better and wider:",
+    ]
     scores = {
         "with theta in its own units": report.score,
         "with theta in standard deviations of the prior": report.score_z,
@@ -227,20 +231,16 @@ def _parameters(report: "StackingReport") -> list[str]:
     what_follows = not_the_prior(report)
     if not what_follows:
         return []
-    lines = [
-        "  the parameters of the pairs are not distributed like the prior (probability "
-        f"that they are: {report.probability_of_prior:.1g})",
-        *textwrap.wrap(
-            what_follows, 88, initial_indent="    ", subsequent_indent="    "
-        ),
-    ]
-    if report.learns_prior:
-        lines += [
-            "    If those to be inferred can be anywhere in the prior, keep it:",
-            "      from sbi_rope.stacking import default_candidates",
-            "      stack(rope, candidates=default_candidates(rope, learn_prior=False))",
-        ]
-    return lines
+    line = (
+        "the parameters of the pairs are not distributed like the prior (probability "
+        f"that they are: {report.probability_of_prior:.1g}). {what_follows}"
+    )
+    if report.learns_prior and report.score_of_prior_kept is not None:
+        line += (
+            " Of the candidates that keep the prior, the best scores "
+            f"{report.score_of_prior_kept:.2f} in own units."
+        )
+    return textwrap.wrap(line, 88, initial_indent="  ", subsequent_indent="    ")
 
 
 def _calibration(report: "StackingReport") -> list[str]:
@@ -409,7 +409,16 @@ def _what_it_took(report: "StackingReport") -> list[str]:
     made = report.provenance
     if not made:
         return []
+    lines = [
+        f"made in {made['seconds']} seconds with {made['simulator calls']} calls of "
+        f"the simulator; longest: {made['longest']}"
+    ]
+    if made["left out"]:
+        lines.append(f"left out: {made['left out']}")
     return [
-        f"  made in {made['seconds']} seconds with {made['simulator calls']} calls of "
-        "the simulator"
+        part
+        for line in lines
+        for part in textwrap.wrap(
+            line, 88, initial_indent="  ", subsequent_indent="    "
+        )
     ]

@@ -19,10 +19,9 @@ from sbi_rope.finetuning import CalibrationFinetuner, finetune_flow
 from sbi_rope.fit import Training
 from sbi_rope.stacking import (
     Candidate,
-    DiscrepancyCandidate,
     FinetunedCandidate,
-    RVNPCandidate,
     StackData,
+    UnlabelledCandidate,
     candidates,
 )
 from sbi_rope.stacking.candidates import corrected, tuned
@@ -36,7 +35,7 @@ pytestmark = [
 ]
 
 SHORT = Training(training_batch_size=50, max_num_epochs=2)
-ALL = [*CANDIDATES, BOX]
+ALL = [*CANDIDATES, BOX, UnlabelledCandidate(observed(40))]
 LEARNING = [one for one in ALL if one.name not in ("prior", "NPE")]
 each = pytest.mark.parametrize("candidate", ALL, ids=lambda one: one.name)
 
@@ -373,22 +372,3 @@ def test_a_version_is_corrected_by_the_discrepancy_of_its_rows() -> None:
             for k in (0, 1)
         ]
     assert all(a > b + 0.3 for a, b in zip(own, others, strict=True))
-
-
-# --- RVNP ---
-
-
-def test_rvnp_learns_from_no_pair() -> None:
-    candidate = RVNPCandidate(observed(60))
-    with (
-        patch("sbi_rope.baselines.rvnp.DEFAULT_TRAINING", SHORT),
-        patch("sbi_rope.stacking.candidates.MAX_OBSERVATIONS", 50),
-    ):
-        data = data_of(rope_of())
-        every = torch.cat(data.folds)
-        first, second = fitted(candidate, data, [data.folds[0], every])
-        other = fitted(candidate, poisoned(data, every), [every])
-    assert first is second
-    assert torch.equal(log_probs(first), log_probs(other[0]))
-    assert not torch.equal(log_probs(first), log_probs(Flow.of([data.estimator])))
-    assert not DiscrepancyCandidate(space="tuned").suits(data)

@@ -19,6 +19,7 @@ from sbi_rope.density import (
     Coupled,
     Density,
     Flow,
+    GaussianProcess,
     Mixture,
     Prior,
     base,
@@ -87,6 +88,14 @@ def coupled(
     return found
 
 
+def process() -> GaussianProcess:
+    with torch.random.fork_rng():
+        torch.manual_seed(5)
+        theta = problems.box(1).sample((20,))
+        x, one = problems.simulate(theta) + 0.2, torch.ones(20)
+        return GaussianProcess(theta, x, weights=one, groups=torch.arange(20))
+
+
 def mixture(*weights: float) -> Mixture:
     parts = [Prior(problems.box(1), (3,)), several("nsf"), coupled(tail_mass=0.0)]
     return Mixture(parts, weights or (0.2, 0.5, 0.3))
@@ -94,6 +103,7 @@ def mixture(*weights: float) -> Mixture:
 
 CASES: dict[str, Callable[[], Density]] = {
     "prior": lambda: Prior(problems.box(1), (3,)),
+    "process": process,
     **{f"one {name}": lambda name=name: Flow.of([npe(name)]) for name in FAMILIES},
     **{f"several {name}": lambda name=name: several(name) for name in FAMILIES},
     **{f"nets of {name}": lambda name=name: with_nets(name) for name in FAMILIES},

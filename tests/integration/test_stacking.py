@@ -235,7 +235,8 @@ def test_many_theta_at_one_x_run_each_network_once(
     monkeypatch.setattr(Flow, "embed", counted)
     theta = problems.box(2).sample((3000,))
     found = posterior.log_prob(theta, x=x)
-    assert sizes == [1] * (len(flows) - 1)  # the prior embeds nothing
+    # The prior and the regressions are no flows.
+    assert sizes == [1] * sum(isinstance(p.average, Flow) for p in posterior.versions)
     assert torch.allclose(
         found[:50], posterior.log_prob_batched(theta[:50, None], x)[:, 0], atol=1e-4
     )
@@ -262,7 +263,11 @@ def test_copies_pickles_and_files_have_the_same_densities(tmp_path: Path) -> Non
         assert torch.equal(other.candidate_log_probs(theta, x), candidates)
         # The density and the candidates share their parts, and so move together.
         shown = {id(part) for part in other.posterior_estimator.parts}
-        assert {id(one.average) for one in other.versions} == shown
+        averages = [one.average for one in other.versions]
+        of_versions = [
+            part for one in averages for part in getattr(one, "parts", [one])
+        ]
+        assert {id(part) for part in of_versions} == shown
 
 
 def test_a_candidate_of_ten_lines_can_be_stacked_reported_and_kept(
@@ -498,7 +503,7 @@ def test_default_candidates_have_different_names_and_can_keep_the_prior() -> Non
         *("prior", "NPE", "fine-tuned NPE", "discrepancy", "discrepancy (input)"),
         *("discrepancy (tuned)", "discrepancy, fine-tuned"),
         *("discrepancy (input), fine-tuned", "discrepancy (tuned), fine-tuned"),
-        "fine-tuned NPE, rehearsed",
+        *("fine-tuned NPE, rehearsed", "regression", "regression (embedding)"),
     ]
     kept = default_candidates(learn_prior=False)
     assert [candidate.name for candidate in kept] == [

@@ -308,10 +308,15 @@ def test_a_report_names_pairs_whose_parameters_do_not_follow_the_prior() -> None
     found = stacked(middle, candidates=candidates).report
     assert found.probability_of_prior is not None
     assert found.probability_of_prior < 1e-3
-    sentence = "pairs are not distributed like the prior (probability that they are: "
-    assert sentence in str(found)
-    assert "The stack has learned where they are." in str(found)
-    assert "default_candidates(rope, learn_prior=False)" in str(found)
+    text = " ".join(str(found).split())
+    assert "pairs are not distributed like the prior (probability that" in text
+    assert "The stack expects the same of new observations" in text
+    assert "default_candidates(rope, learn_prior=False)" in text
+    # What keeping it would score: the better of the prior and NPE.
+    scores = found.cross_validation
+    best = max(float(scores.scores_of(name).mean()) for name in ("prior", "NPE"))
+    assert found.score_of_prior_kept == pytest.approx(best)
+    assert f"the best scores {best:.2f} in own units" in text
     # These pairs follow the prior.
     usual = the_stack().report
     assert usual.probability_of_prior is not None
@@ -331,7 +336,7 @@ def test_a_stack_that_keeps_the_prior_says_what_holds_for_the_pairs_only() -> No
     # A user's candidate that is trained on the pairs does not keep it.
     mixed = stacked(middle, candidates=[PRIOR, NPE, BOX]).report
     assert mixed.learns_prior
-    assert "The stack has learned where they are." in str(mixed)
+    assert "The stack expects the same of new observations" in str(mixed)
 
 
 def test_a_report_knows_how_it_was_made() -> None:
@@ -339,6 +344,16 @@ def test_a_report_knows_how_it_was_made() -> None:
     assert made["seed"] == "0"
     assert f"torch {torch.__version__}" in made["versions"]
     assert "UTC" in made["finished"]
+    assert made["longest"].count(" s") == 3
+    # Candidates that a user has chosen leave nothing out.
+    assert not stacked(rope_of(), candidates=[PRIOR]).report.provenance["left out"]
+
+
+def test_a_report_says_which_default_candidates_the_data_do_not_allow() -> None:
+    rope = rope_of(problem(8, seed=1))
+    text = " ".join(str(stacked(rope).report).split())
+    assert "regression (needs 10 exact labels of continuous parameters, no NaN)" in text
+    assert "fine-tuned NPE, rehearsed (needs 100 pairs, long x)" in text
 
 
 def test_calibration_is_that_of_held_out_pairs() -> None:

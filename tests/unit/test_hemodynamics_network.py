@@ -32,25 +32,25 @@ def test_the_geometry_is_the_published_one() -> None:
     lines = path.read_text().splitlines()
     lines = [line for line in lines if not line.startswith("#")][1:]
     expected = np.array([[float(x) for x in line.split(",")[1:6]] for line in lines])
-    table = np.array([segment[1:] for segment in arteries.SEGMENTS], dtype=float)
+    table = arteries.SEGMENTS.T
     np.testing.assert_allclose(table, expected * [1, 1, 1e3, 1e3, 1e3])
 
 
 def test_all_segments_are_connected_with_the_heart() -> None:
-    reached = {arteries.SEGMENTS[0][1]}
+    reached = {arteries.SEGMENTS[0, 0]}
     for _ in range(NUM_SEGMENTS):
-        for segment in arteries.SEGMENTS:
-            if reached & set(segment[1:3]):
-                reached |= set(segment[1:3])
+        for segment in arteries.SEGMENTS.T:
+            if reached & set(segment[:2]):
+                reached |= set(segment[:2])
     assert reached == set(range(1, 110))
 
 
 def test_every_blind_end_has_a_vascular_bed_and_nothing_else_has() -> None:
-    ends = [node for segment in arteries.SEGMENTS for node in segment[1:3]]
+    ends = [node for segment in arteries.SEGMENTS.T for node in segment[:2]]
     blind = {
         i
-        for i, segment in enumerate(arteries.SEGMENTS, start=1)
-        if ends.count(segment[2]) == 1
+        for i, segment in enumerate(arteries.SEGMENTS.T, start=1)
+        if ends.count(segment[1]) == 1
     }
     in_beds = [segment for bed in arteries.BEDS for segment in bed[0]]
     assert sorted(in_beds) == sorted(blind)
@@ -113,7 +113,7 @@ def test_a_wave_velocity_follows_from_the_tube_law() -> None:
 
 def test_only_walls_of_segments_longer_than_11_mm_are_viscous() -> None:
     network = build_network(BASELINE, Physics())
-    long = np.array([segment[3] > 11.0 for segment in arteries.SEGMENTS])
+    long = arteries.SEGMENTS[2] > 11.0
     np.testing.assert_array_equal(network.wall_viscosity[0] > 0, long)
     assert float(network.viscosity(21, np.array(0.0015))) == pytest.approx(
         0.6 + 1.5e-3 / 0.003
@@ -127,7 +127,7 @@ def test_short_segments_are_stretched_and_no_others() -> None:
     factors = tuple(np.linspace(0.5, 1.5, NUM_SEGMENTS))
     subject = replace(BASELINE, length_factors=factors)
     network = build_network(subject, Physics(min_segment_length=0.02))
-    table = 1e-3 * np.array([segment[3] for segment in arteries.SEGMENTS])
+    table = 1e-3 * arteries.SEGMENTS[2]
     np.testing.assert_allclose(network.length, np.maximum(table * factors, 0.02))
 
 

@@ -392,6 +392,21 @@ def test_stored_parameters_that_are_no_draws_of_the_prior_are_warned_of() -> Non
         RoPE(gaussian.posterior(), simulations=(theta, gaussian.simulator(theta)))
 
 
+def test_labels_that_do_not_follow_the_prior_are_warned_of_once_with_tau_1() -> None:
+    theta = gaussian.prior().sample((40,))
+    for scale in (1.0, 0.2):
+        rope = RoPE(gaussian.posterior(), simulator=gaussian.simulator, finetuner=QUICK)
+        rope.append_calibration(scale * theta, gaussian.simulator(scale * theta))
+        rope.train(seed=0, show_progress_bars=False)
+        found = []
+        for tau in (0.9, 1.0, 1.0):
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                rope.build_posterior(X_O, coupler=SinkhornCoupler(gamma=0.5, tau=tau))
+            found.append(any("distributed like the" in str(w.message) for w in caught))
+        assert found == [False, scale < 1, False]
+
+
 def test_moving_our_posterior_moves_nothing_else() -> None:
     npe = gaussian.posterior()
     conductor = RoPE(npe, simulator=gaussian.simulator, finetuner=QUICK)

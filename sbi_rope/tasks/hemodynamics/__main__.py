@@ -13,7 +13,6 @@ from pathlib import Path
 import torch
 
 from sbi_rope.errors import RoPEError
-from sbi_rope.tasks.__main__ import print_table
 from sbi_rope.tasks.hemodynamics.dataset import load
 from sbi_rope.tasks.hemodynamics.generation import generate
 from sbi_rope.tasks.hemodynamics.population import NUISANCES, PROCESSES, Population
@@ -114,7 +113,10 @@ def _info(file: Path) -> None:
     }
     if beats.length_factors is not None:
         columns["mean length factor"] = beats.length_factors.mean(dim=1)
-    print_table("waves at the left wrist, and people", columns)
+    print(f"{'waves at the left wrist, and people':<36}{'mean':>11}{'sd':>11}")
+    for name, values in columns.items():
+        mean, std = values.double().mean(), values.double().std(correction=0)
+        print(f"  {name:<34}{float(mean):>11.4g}{float(std):>11.4g}")
 
 
 if __name__ == "__main__":

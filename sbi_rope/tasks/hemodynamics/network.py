@@ -116,14 +116,12 @@ def build_network(subject: Subject, physics: Physics) -> Network:
     Raises:
         SimulationError: If no stiffness gives the subject's wave velocity.
     """
-    columns = list(zip(*arteries.SEGMENTS, strict=True))
-    inlet_node, outlet_node = np.array(columns[1]) - 1, np.array(columns[2]) - 1
-    table_length = 1e-3 * np.array(columns[3])
+    columns = arteries.SEGMENTS
+    inlet_node, outlet_node = columns[:2].astype(int) - 1
+    table_length = 1e-3 * columns[2]
     length = table_length * np.array(subject.length_factors)
     length = np.maximum(length, physics.min_segment_length)
-    inlet, outlet = _radii(
-        1e-3 * np.array(columns[4]), 1e-3 * np.array(columns[5]), subject
-    )
+    inlet, outlet = _radii(1e-3 * columns[3], 1e-3 * columns[4], subject)
     k3 = _solve_stiffness(length, inlet, outlet, subject)
     ones = np.ones_like(length)
     # Which walls are viscous is a matter of the table: a stretched segment stays so.
@@ -187,10 +185,10 @@ def _stiffness(radius: np.ndarray, k1: float, k2: float, k3: float) -> np.ndarra
 def _radii(
     inlet: np.ndarray, outlet: np.ndarray, subject: Subject
 ) -> tuple[np.ndarray, np.ndarray]:
-    columns = list(zip(*arteries.SEGMENTS, strict=True))
+    inlet_node, outlet_node, *_ = arteries.SEGMENTS
     large = (inlet + outlet) / 2 >= arteries.LARGE_RADIUS
     # Branches of large arteries begin as wide as the table has it relative to them.
-    begins_large = large | np.isin(columns[1], np.array(columns[2])[large])
+    begins_large = large | np.isin(inlet_node, outlet_node[large])
     factor = subject.diameter_factor
     return np.where(begins_large, factor, 1.0) * inlet, np.where(
         large, factor, 1.0

@@ -1,0 +1,50 @@
+r"""Regression of parameters on real observations, without a simulator."""
+
+from typing import Any
+
+import torch
+
+from sbi_rope.density import GaussianProcess, MixturePosterior
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.trainers.base import Method
+
+__all__ = ["Regression"]
+
+
+class Regression(Method):
+    r"""A Gaussian process from real observations to parameters, without simulations.
+
+    Sees the calibration set alone, and assumes that parameters depend smoothly on the
+    entries of x, or on its principal components if there are more than 20. Says what
+    the labels are worth without a simulator: a method that uses one and does worse is
+    not worth its simulations. See :class:`~sbi_rope.density.GaussianProcess`.
+
+    References:
+        | Gaussian Processes for Machine Learning (Rasmussen and Williams, 2006)
+        | http://gaussianprocess.org/gpml, sections 2.2, 5.4.1 and 5.4.2
+
+    Args:
+        prior: A torch distribution over parameters of shape ``(d,)``.
+        device: Where to compute; data on other devices is moved there.
+
+    Raises:
+        InvalidInputError: In ``train``, if a parameter is the same in all pairs.
+    """
+
+    sees = frozenset({"calibration"})
+    min_pairs = 2
+
+    def __init__(self, prior: Any, *, device: str | torch.device = "cpu") -> None:
+        super().__init__(prior, device=device)
+
+    def _fit(self, *, show_progress_bars: bool) -> tuple[MixturePosterior, None]:
+        pairs = self._data.pairs
+        if bool((pairs.mean == pairs.mean[0]).all(dim=0).any()):
+            raise InvalidInputError(
+                "Expected calibration pairs that differ in each parameter; got one "
+                "that is the same in all."
+            )
+        density = GaussianProcess(
+            pairs.mean, pairs.x, weights=pairs.counts.weights, groups=pairs.group
+        )
+        return MixturePosterior(density, self._prior), None
