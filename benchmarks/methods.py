@@ -24,6 +24,7 @@ from sbi_rope.baselines import (
     PlainNPE,
     PriorBaseline,
     ReferenceNPE,
+    Regression,
     Training,
     TuningOnly,
 )
@@ -35,10 +36,9 @@ if TYPE_CHECKING:
     from benchmarks.cases import Case
 
 __all__ = [
-    "COUPLED_STACK",
     "GIVEN_PRIOR_STACK",
     "METHODS",
-    "RVNP_STACK",
+    "OBSERVED_STACK",
     "STACK",
     "STACKS",
     "Entry",
@@ -47,7 +47,7 @@ __all__ = [
 ]
 
 # Tasks whose observations are statistics: NNPE's noise is on them, not on h(x).
-STATISTICS = ("cs", "sir", "linear_gaussian")
+STATISTICS = ("cs", "sir", "linear_gaussian", "ocean_colour")
 # More entries are no list of statistics that RNPE's chains could go through.
 MAX_STATISTICS = 10
 # With more entries than these, x itself is no list of summaries to be corrected.
@@ -65,13 +65,14 @@ LOOK_UP = (
     "OT-only",
     "tuning-only",
 )
-# Of the pairs alone; of candidates that keep NPE's prior; and with RVNP, which learns
-# from the test set without its labels.
+# Of the pairs alone; of candidates that keep NPE's prior; and with a candidate that
+# learns from the test set without its labels.
 STACK, GIVEN_PRIOR_STACK = "stack", "stack, given prior"
-RVNP_STACK = "stack with RVNP"
-# It also had couplings of the test set among its candidates, up to commit 616aef8.
-COUPLED_STACK = "stack of a batch"
-STACKS = (STACK, GIVEN_PRIOR_STACK, RVNP_STACK, COUPLED_STACK)
+OBSERVED_STACK = "stack with x_o"
+# They had RVNP, or couplings of the test set, among their candidates, up to commit
+# 616aef8.
+PAST_STACKS = ("stack with RVNP", "stack of a batch")
+STACKS = (STACK, GIVEN_PRIOR_STACK, OBSERVED_STACK, *PAST_STACKS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -260,6 +261,11 @@ METHODS: dict[str, Entry] = {
             device=case.device,
         ),
     ),
+    "Regression": Entry(
+        style=("0.35", "--", "x"),
+        pairs=True,
+        build=lambda case: Regression(case.task.get_prior(), device=case.device),
+    ),
     "MLP": Entry(
         style=("0.35", ":", "x"),
         pairs=True,
@@ -294,7 +300,7 @@ METHODS: dict[str, Entry] = {
         style=("#882255", "--", "h"),
         pairs=True,
         ours=True,
-        tasks=("cs", "light_tunnel_sensors", "linear_gaussian", "sir"),
+        tasks=("cs", "light_tunnel_sensors", "linear_gaussian", "ocean_colour", "sir"),
         build=_discrepancy("input"),
     ),
     "discrepancy (tuned)": Entry(
@@ -378,8 +384,11 @@ METHODS: dict[str, Entry] = {
     ),
     STACK: Entry(style=("black", "-", "*"), pairs=True),
     GIVEN_PRIOR_STACK: Entry(style=("black", "-.", "*"), pairs=True, extra=True),
-    RVNP_STACK: Entry(style=("black", ":", "*"), pairs=True, observations=True),
-    COUPLED_STACK: Entry(
-        style=("black", "--", "*"), pairs=True, observations=True, past=True
-    ),
+    OBSERVED_STACK: Entry(style=("black", ":", "*"), pairs=True, observations=True),
+    **{
+        name: Entry(style=style, pairs=True, observations=True, past=True)
+        for name, style in zip(
+            PAST_STACKS, (("0.5", ":", "*"), ("black", "--", "*")), strict=True
+        )
+    },
 }

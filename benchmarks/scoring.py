@@ -13,7 +13,7 @@ from benchmarks.cells import Cell
 from benchmarks.methods import (
     GIVEN_PRIOR_STACK,
     METHODS,
-    RVNP_STACK,
+    OBSERVED_STACK,
     STACK,
     STACKS,
     append_data,
@@ -184,7 +184,7 @@ def _stack_score(case: Case, cell: Cell) -> Score:
     candidates = None
     if cell.method == GIVEN_PRIOR_STACK:
         candidates = default_candidates(rope, learn_prior=False)
-    elif cell.method == RVNP_STACK:
+    elif cell.method == OBSERVED_STACK:
         candidates = default_candidates(rope, case.test_set[1])
     posterior = stack(
         rope,
