@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 # The most lines of all files of a kind in a folder, docstrings included.
 BUDGETS = {
-    "sbi_rope/*.py": 30_000,
+    "sbi_rope/*.py": 30_400,
     "tests/*.py": 25_000,
     "benchmarks/*.py": 4_000,
     "docs/*.md": 4_000,

@@ -2,14 +2,11 @@ r"""Regression of parameters on observations, without a simulator."""
 
 import copy
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from scipy.optimize import minimize
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from torch import Tensor, nn
 from torch.distributions import Chi2
 
@@ -171,15 +168,18 @@ def _inputs(phi: Tensor) -> tuple[Tensor, Tensor]:
 
 def _learned(inputs: Tensor, y: Tensor) -> Tensor:
     """Return the variance, the length scales and the noise at their posterior mode."""
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+
     some = torch.randperm(len(inputs))[:MAX_PAIRS].to(inputs.device)
     width = inputs.shape[1]
-    lengths = np.full(width, LENGTH[0] * width**0.5)
-    kernel = (
+    lengths: Any = np.full(width, LENGTH[0] * width**0.5)
+    kernel: Any = (
         ConstantKernel(VARIANCE[0], (1e-3, 1e4)) * RBF(lengths, (1e-2, 1e5))
     ) + WhiteKernel(NOISE[0], (1e-8, 1e2))
     spread = np.array([VARIANCE[1], *[LENGTH[1]] * width, NOISE[1]])
 
-    def mode(loss: Any, start: np.ndarray, bounds: Sequence[Any]) -> tuple[Any, Any]:
+    def mode(loss: Any, start: Any, bounds: Any) -> tuple[Any, Any]:
         def negative_log_posterior(at: np.ndarray) -> tuple[Any, Any]:
             value, gradient = loss(at)
             off = (at - start) / spread
@@ -195,6 +195,7 @@ def _learned(inputs: Tensor, y: Tensor) -> Tensor:
         )
         return found.x, found.fun
 
-    process = GaussianProcessRegressor(kernel, optimizer=mode)
+    optimiser: Any = mode
+    process: Any = GaussianProcessRegressor(kernel, optimizer=optimiser)
     process.fit(inputs[some].cpu().numpy(), y[some].cpu().numpy())
     return torch.from_numpy(np.exp(process.kernel_.theta)).to(y)

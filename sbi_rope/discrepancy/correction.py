@@ -27,6 +27,7 @@ from sbi_rope.simulate import Moments
 
 __all__ = [
     "Correction",
+    "SimulatedConstants",
     "Space",
     "correct_flow",
     "fit_discrepancy",

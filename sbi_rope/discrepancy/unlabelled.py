@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from sklearn.mixture import GaussianMixture
 from torch import Tensor, nn
 
 from sbi_rope._random import seeded
@@ -42,6 +41,8 @@ class Marginal(NamedTuple):
     @classmethod
     def of(cls, z_s: Tensor) -> "Marginal":
         """Fit the mixture to simulations, shape ``(n_s, l)``."""
+        from sklearn.mixture import GaussianMixture
+
         mixture = GaussianMixture(NUM_COMPONENTS, random_state=0, reg_covar=1e-4)
         mixture.fit(z_s[:NUM_FITTED].double().cpu().numpy())
         found = mixture.weights_, mixture.means_, mixture.covariances_
@@ -183,6 +184,7 @@ def _polished(
         with torch.enable_grad():
             return torch.autograd.grad(loss(values).sum(), values)[0]
 
+    root = torch.eye(at.shape[1]).to(at).expand(len(at), -1, -1)
     for _ in range(NUM_HESSIANS):
         columns = []
         for step in STEP * torch.eye(at.shape[1]).to(at):

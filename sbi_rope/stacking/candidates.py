@@ -22,6 +22,7 @@ from sbi_rope._standardisation import Standardisation
 from sbi_rope.density import Density, Flow, GaussianProcess, Given, Prior, density_of
 from sbi_rope.discrepancy.correction import (
     Correction,
+    SimulatedConstants,
     Space,
     correct_flow,
     fit_discrepancy,
@@ -485,7 +486,12 @@ class RegressionCandidate(Settings, Candidate):
 
     space: Literal["embedding", "input"] = "input"
     family = "regression"
-    needs = f"{MIN_TO_REGRESS} exact labels of continuous parameters, no NaN"
+
+    @property
+    def needs(self) -> str:  # type: ignore[override]
+        """What the data need for it."""
+        needs = f"{MIN_TO_REGRESS} exact labels of continuous parameters, x without NaN"
+        return needs + (", an embedding net" if self.space == "embedding" else "")
 
     @property
     def name(self) -> str:  # type: ignore[override]
@@ -493,10 +499,7 @@ class RegressionCandidate(Settings, Candidate):
         return "regression" + (" (embedding)" if self.space == "embedding" else "")
 
     def suits(self, data: StackData) -> bool:
-        """Tell whether there are ten exact labels of continuous parameters, and no NaN.
-
-        Without an embedding net, h(x) is x.
-        """
+        """Tell whether the data are as it needs them."""
         if self.space == "embedding" and not has_parameters(data.embedding_net):
             return False
         theta, pairs = data.pairs.mean, data.pairs
@@ -510,8 +513,12 @@ class RegressionCandidate(Settings, Candidate):
 
     def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
         """Fit a process to each version of the pairs."""
-        net = data.embedding_net if self.space == "embedding" else None
-        pairs = data.pairs
+        pairs, net = data.pairs, None
+        if self.space == "embedding":
+            net = data.embedding_net
+        elif pairs.x.ndim == 2 and torch.isfinite(x_s := data.simulations[1]).all():
+            # Entries that never vary in simulations are ignored, as by all candidates.
+            net = SimulatedConstants(Standardisation(x_s.double()))
         return [
             GaussianProcess(
                 pairs.mean[rows],

@@ -48,6 +48,7 @@ SEES = {
     "RNPE": {"simulations"},
     "RVNP": {"simulations", "observations"},
     "ReferenceNPE": {"simulations"},
+    "Regression": {"calibration"},
     "TuningOnly": {"simulations", "calibration"},
 }
 

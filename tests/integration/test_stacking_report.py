@@ -352,7 +352,10 @@ def test_a_report_knows_how_it_was_made() -> None:
 def test_a_report_says_which_default_candidates_the_data_do_not_allow() -> None:
     rope = rope_of(problem(8, seed=1))
     text = " ".join(str(stacked(rope).report).split())
-    assert "regression (needs 10 exact labels of continuous parameters, no NaN)" in text
+    assert (
+        "regression (needs 10 exact labels of continuous parameters, x without NaN)"
+        in text
+    )
     assert "fine-tuned NPE, rehearsed (needs 100 pairs, long x)" in text
 
 
