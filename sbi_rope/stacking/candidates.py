@@ -540,8 +540,9 @@ MIN_OBSERVATIONS, MAX_OBSERVATIONS, MAX_ENTRIES = 30, 200, 10
 class UnlabelledCandidate(Candidate):
     """NPE trained on corrected simulations, as learned from unlabelled x, too.
 
-    See :func:`~sbi_rope.discrepancy.unlabelled.fit_unlabelled`. It assumes that the
-    parameters of the observations follow the prior. The labels decide about its weight.
+    The density of an observation without label is closed for a Gaussian mixture of
+    simulations, see ``sbi_rope.discrepancy.unlabelled``. It assumes that the parameters
+    of the observations follow the prior. The labels decide about its weight.
 
     Args:
         x_o: Real observations, shape ``(n_o, l)``. The stack may be asked about these
