@@ -166,7 +166,7 @@ def stack(
                 f"{name} {seconds[name]:.0f} s"
                 for name in sorted(seconds, key=lambda one: -seconds[one])[:3]
             ),
-            "left out": left_out(stacked, x_o) if candidates is None else "",
+            **({"left out": left_out(stacked, x_o)} if candidates is None else {}),
             "simulator calls": f"{rope.num_simulator_calls - calls:,}",
             "finished": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
             "versions": ", ".join(f"{name} {version(name)}" for name in PACKAGES),

@@ -73,8 +73,7 @@ IF_IT_DEPENDS = (
 
 # What follows if the parameters of the pairs do not follow the prior.
 IF_LEARNED = (
-    "The stack expects the same of new observations; for others use "
-    "`candidates=default_candidates(rope, learn_prior=False)`."
+    "The stack expects the same of new observations, and is too sure about others."
 )
 IF_KEPT = (
     "The stack keeps the prior. It may look too wide for such parameters, and its "
@@ -235,12 +234,25 @@ def _parameters(report: "StackingReport") -> list[str]:
         "the parameters of the pairs are not distributed like the prior (probability "
         f"that they are: {report.probability_of_prior:.1g}). {what_follows}"
     )
-    if report.learns_prior and report.score_of_prior_kept is not None:
+    if report.learns_prior:
         line += (
-            " Of the candidates that keep the prior, the best scores "
-            f"{report.score_of_prior_kept:.2f} in own units."
+            " For others use `candidates=default_candidates(rope, learn_prior=False)`."
         )
-    return textwrap.wrap(line, 88, initial_indent="  ", subsequent_indent="    ")
+        if (kept := report.score_of_prior_kept) is not None:
+            line += f" The best candidate that keeps the prior scores {kept:.2f} here."
+    return _wrapped([line], indent=2)
+
+
+def _wrapped(lines: Sequence[str], *, indent: int) -> list[str]:
+    """Break sentences into lines of the report."""
+    first, others = " " * indent, " " * (indent + 2)
+    return [
+        part
+        for line in lines
+        for part in textwrap.wrap(
+            line, 88, initial_indent=first, subsequent_indent=others
+        )
+    ]
 
 
 def _calibration(report: "StackingReport") -> list[str]:
@@ -322,13 +334,7 @@ def _by_estimate(report: "StackingReport") -> list[str]:
     lines = coverage_by_estimate(report)
     if depends_on_estimate(report):
         lines.append(IF_IT_DEPENDS)
-    return [
-        part
-        for line in lines
-        for part in textwrap.wrap(
-            line, 88, initial_indent="    ", subsequent_indent="      "
-        )
-    ]
+    return _wrapped(lines, indent=4)
 
 
 def _sets(report: "StackingReport") -> list[str]:
@@ -413,12 +419,6 @@ def _what_it_took(report: "StackingReport") -> list[str]:
         f"made in {made['seconds']} seconds with {made['simulator calls']} calls of "
         f"the simulator; longest: {made['longest']}"
     ]
-    if made["left out"]:
+    if "left out" in made:
         lines.append(f"left out: {made['left out']}")
-    return [
-        part
-        for line in lines
-        for part in textwrap.wrap(
-            line, 88, initial_indent="  ", subsequent_indent="    "
-        )
-    ]
+    return _wrapped(lines, indent=2)

@@ -3,7 +3,7 @@ r"""The base class of all tasks: a prior, a simulator and labelled observations.
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
@@ -42,7 +42,7 @@ class Task(ABC):
     2. implement :meth:`get_prior`: a new float32 distribution with event shape
        ``(theta_dim,)``, a ``support``, a ``mean`` and a ``variance``. Build tensors
        with an explicit dtype, so that torch's default does not matter. Implement
-       :meth:`prior_quantiles` too;
+       :meth:`prior_quantiles` too, unless it is a box;
     3. implement :meth:`get_simulator`: an instance of a class defined at the top of
        a module (so that it can be pickled) whose ``__call__`` passes its input
        through ``as_batch``, draws from torch's global generator, and keeps the dtype
@@ -147,9 +147,13 @@ class Task(ABC):
     def get_prior(self) -> Distribution:
         """Return a new prior over theta, event shape ``(theta_dim,)``."""
 
-    @abstractmethod
     def prior_quantiles(self, theta: Tensor) -> Tensor:
-        """Return the prior's marginal distribution functions at theta ``(n, d)``."""
+        """Return the prior's marginal distribution functions at theta ``(n, d)``.
+
+        Of a box, these are relative positions. Tasks with other priors override it.
+        """
+        prior: Any = self.get_prior()
+        return prior.base_dist.cdf(theta)
 
     @abstractmethod
     def get_simulator(self) -> Simulator:

@@ -159,10 +159,6 @@ class CancerStroma(Task):
         """Return the uniform prior, whose log density is -log 221000."""
         return box((200.0, 3.0, 10.0), (1500.0, 20.0, 20.0))
 
-    def prior_quantiles(self, theta: Tensor) -> Tensor:
-        """Return relative positions in the box, shape ``(n, 3)``."""
-        return self.get_prior().base_dist.cdf(theta)
-
     def get_simulator(self) -> CancerStromaSimulator:
         """Return the simulator without necrosis."""
         return CancerStromaSimulator()

@@ -128,10 +128,6 @@ class NearInfrared(Task):
         """Return the uniform prior."""
         return box((35.0, 0.0, 8.0), (80.0, 55.0, 25.0))
 
-    def prior_quantiles(self, theta: Tensor) -> Tensor:
-        """Return relative positions in the box, shape ``(n, 3)``."""
-        return self.get_prior().base_dist.cdf(theta)
-
     def get_simulator(self) -> NearInfraredSimulator:
         """Return the law of Beer and Lambert with textbook spectra."""
         return NearInfraredSimulator()

@@ -129,10 +129,6 @@ class OceanColour(Task):
         """Return the uniform prior."""
         return box((-2.0, -3.0), (2.0, 0.5))
 
-    def prior_quantiles(self, theta: Tensor) -> Tensor:
-        """Return relative positions in the box, shape ``(n, 2)``."""
-        return self.get_prior().base_dist.cdf(theta)
-
     def get_simulator(self) -> OceanColourSimulator:
         """Return the textbook laws."""
         return OceanColourSimulator()

@@ -136,10 +136,6 @@ class Pendulum(Task):
         """Return the uniform prior on [0, 3] x [0.5, 10], whose density is 1 / 28.5."""
         return box((0.0, 0.5), (3.0, 10.0))
 
-    def prior_quantiles(self, theta: Tensor) -> Tensor:
-        """Return relative positions in the box, shape ``(n, 2)``."""
-        return self.get_prior().base_dist.cdf(theta)
-
     def get_simulator(self) -> PendulumSimulator:
         """Return the simulator without friction."""
         return PendulumSimulator(noise_std=self.noise_std)

@@ -118,10 +118,6 @@ class WindTunnel(Task):
         """Return the uniform prior on [0, 45] degrees, whose density is 1 / 45."""
         return box((0.0,), (MAX_HATCH,), closed=True)
 
-    def prior_quantiles(self, theta: Tensor) -> Tensor:
-        """Return relative positions of the hatch, shape ``(n, 1)``."""
-        return self.get_prior().base_dist.cdf(theta)
-
     def get_simulator(self) -> WindTunnelSimulator:
         """Return the published model with noise and an impulse at a random time."""
         return WindTunnelSimulator(onset_jitter=self.onset_jitter)
