@@ -154,14 +154,18 @@ def _use_one_thread() -> None:
 
 def _row(case: Case, score: Score) -> dict[str, Any]:
     evaluation = score.evaluation
-    names = case.task.parameter_names
-    per_parameter = zip(names, evaluation.acauc.per_parameter.tolist(), strict=True)
+    names, log_prob = case.task.parameter_names, evaluation.log_prob
+    acauc = [one.mean for one in evaluation.acauc_of_parameters]
+    per_parameter = zip(names, acauc, strict=True)
+    root = len(log_prob) ** 0.5
     return {
         **asdict(score.cell),
         "status": "finished",
         **evaluation.as_row(),
-        "lpp_standard_error": evaluation.lpp.standard_error,
-        "acauc_standard_error": evaluation.acauc.standard_error,
+        "lpp_median": float(log_prob.quantile(0.5, interpolation="nearest")),
+        "neg_inf_fraction": float(log_prob.isneginf().double().mean()),
+        "lpp_standard_error": float(log_prob.std()) / root,
+        "acauc_standard_error": float(evaluation.levels.mean(dim=1).std()) / root,
         "acauc_per_parameter": "; ".join(f"{n}={v:.4f}" for n, v in per_parameter),
         "c2st": _c2st(case, score),
         "converged": score.converged,
@@ -206,8 +210,8 @@ def _arrays(score: Score) -> dict[str, np.ndarray]:
         torch.manual_seed(0)
         samples = draw_samples(score.posterior, x, num_samples=KEPT_SAMPLES)
     return {
-        "log_probs": _shortened(evaluation.lpp.log_probs.cpu().numpy()),
-        "coverage": evaluation.coverage.average.cpu().numpy().astype(np.float32),
+        "log_probs": _shortened(evaluation.log_prob.cpu().numpy()),
+        "coverage": evaluation.coverage.mean(dim=1).cpu().numpy().astype(np.float32),
         **score.arrays,
         "samples": samples[:, 0].cpu().numpy().astype(np.float32),
         "theta": score.test_set[0][0].cpu().numpy().astype(np.float32),

@@ -210,13 +210,14 @@ def _candidates(case: Case, posterior: StackedPosterior) -> dict[str, np.ndarray
 
     The stack itself comes last. In standard deviations of the prior.
     """
-    held_out = posterior.report.cross_validation
+    report = posterior.report
     unit = float(case.task.prior_std.log().sum())
     test = posterior.candidate_log_probs(*case.test_set)
-    scores = torch.cat([held_out.log_scores, held_out.stack_scores[:, None]], dim=1)
+    stack = report.held_out.log_prob[:, None]
+    scores = torch.cat([report.log_scores, stack], dim=1)
     return {
-        "candidates": np.array([*held_out.names, STACK]),
-        "weights": np.array([*held_out.weights.weights.tolist(), np.nan]),
+        "candidates": np.array([*report.names, STACK]),
+        "weights": np.array([*report.weights.weights.tolist(), np.nan]),
         "held_out": (scores.mean(dim=0) + unit).cpu().numpy(),
         "held_out_error": (scores.std(dim=0) / len(scores) ** 0.5).cpu().numpy(),
         "test": (test.mean(dim=0) + unit).cpu().numpy(),

@@ -74,11 +74,11 @@ def trained_npe() -> tuple[Any, Any]:
 
 def overconfident(npe: Any, posterior: Any, theta_o: Tensor, x_o: Tensor) -> "Figure":
     """Draw the coverage of NPE and of the stack."""
-    curves = {
-        name: evaluate(one, theta_o, x_o, num_samples=500, seed=0).coverage
+    found = {
+        name: evaluate(one, theta_o, x_o, num_samples=1000, seed=0)
         for name, one in {"NPE": npe, "stack": posterior}.items()
     }
-    return plots.calibration_curves(curves)
+    return plots.calibration_curves(found)
 
 
 def one_observation(npe: Any, posterior: Any, theta: Tensor, x: Tensor) -> "Figure":

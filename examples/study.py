@@ -98,7 +98,7 @@ class Study:
             source = {"simulator": task.get_simulator()}
         else:
             source = {"simulations": self.stored(task, seed)}
-        curves: dict[str, Any] = {}
+        evaluations: dict[str, Evaluation] = {}
 
         def score(
             method: str,
@@ -115,7 +115,7 @@ class Study:
                 num_samples=NUM_SAMPLES,
                 seed=seed,
             )
-            curves[method] = evaluation.coverage
+            evaluations[method] = evaluation
             results.append(
                 task=task.name,
                 variant=task.variant,
@@ -179,7 +179,7 @@ class Study:
                 )
                 print(diagnosis, flush=True)
                 self._save(plots.implied_parameters(diagnosis), f"diagnosis_{name}")
-            self._draw(name, npe, rope, posterior, theta_o, curves)
+            self._draw(name, npe, rope, posterior, theta_o, evaluations)
 
     def _draw(
         self,
@@ -188,7 +188,7 @@ class Study:
         rope: RoPE,
         posterior: Any,
         theta_o: Tensor,
-        curves: dict[str, Any],
+        evaluations: dict[str, Evaluation],
     ) -> None:
         task, x_o = self.task, posterior.x_o
         with torch.random.fork_rng(), torch.no_grad():
@@ -226,7 +226,7 @@ class Study:
             "posterior": plots.pair_plot(
                 samples, theta_o[0], parameter_names=names, prior=prior
             ),
-            "calibration": plots.calibration_curves(curves),
+            "calibration": plots.calibration_curves(evaluations),
             "finetuning": plots.finetuning_history(rope.history),
             "coupling": plots.effective_sample_sizes(posterior.coupling),
         }

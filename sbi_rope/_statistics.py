@@ -1,5 +1,6 @@
 """Weighted means over calibration pairs with their errors, and permutation tests."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,19 +11,15 @@ from torch import Tensor
 
 from sbi_rope._prior import divisors
 from sbi_rope._random import seeded
-from sbi_rope.data import Counts, one_of_each_group
+from sbi_rope.data import effective_number, group_means, one_of_each_group
 
 __all__ = [
     "LEVEL",
+    "Estimate",
     "PermutationTest",
     "TwoSampleTest",
     "compare_with_pairs",
-    "interval_of_mean",
-    "mean_and_error",
-    "mean_of_known",
-    "means_of_pairs",
     "permutation_test",
-    "standard_error_of_mean",
 ]
 
 NUM_PERMUTATIONS = 1000
@@ -46,63 +43,76 @@ FARTHEST = 10.0
 # Means --------------------------------------------------------------------------------
 
 
-def standard_error_of_mean(values: Tensor) -> float:
-    """Return that of a vector: NaN for a single value, infinite if a value is."""
-    if values.numel() < 2:
-        return float("nan")
-    if torch.isinf(values).any():
-        return float("inf")
-    return float(values.double().std() / values.numel() ** 0.5)
+@dataclass(frozen=True)
+class Estimate:
+    """A mean with the ends of its interval, which are NaN for a single value.
 
+    Formatting applies to all three numbers.
 
-def mean_and_error(values: Tensor, counts: Counts | None) -> tuple[float, float]:
-    """Return the mean of a number for each pair, ``(n,)``, and its standard error.
-
-    Counts of None are one for each pair. The error is infinite if a value is.
+    Attributes:
+        mean: The mean.
+        low: The lower end.
+        high: The upper end.
     """
-    if counts is None:
-        return float(values.mean()), standard_error_of_mean(values)
-    values, weights = counts.of_groups(values)
-    n = len(values)
-    mean = (weights * values).sum() / weights.sum()
-    if torch.isinf(values).any():
-        return float(mean), float("inf")
-    square = (weights * (values - mean)).square().sum() / weights.sum().square()
-    return float(mean), float((square * n / max(1, n - 1)).sqrt())
 
+    mean: float
+    low: float = math.nan
+    high: float = math.nan
 
-def interval_of_mean(
-    values: Tensor, counts: Counts | None
-) -> tuple[float, float, float]:
-    """Return a mean over pairs and the ends of its 95 % interval of Student's t.
+    @classmethod
+    def of(
+        cls,
+        values: Tensor,
+        weight: Tensor | None = None,
+        group: Tensor | None = None,
+        *,
+        confidence: float = 0.95,
+    ) -> "Estimate":
+        r"""Return a weighted mean and its interval of Student's t over groups.
 
-    Example:
-        >>> mean, low, high = interval_of_mean(torch.tensor([1.0, 2.0, 3.0]), None)
-        >>> print(f"{mean:.2f}, from {low:.2f} to {high:.2f}")
-        2.00, from -0.48 to 4.48
-    """
-    mean, error = mean_and_error(values, counts)
-    n = float(len(values))
-    if counts is not None:
-        # A few that count as much as all others tell as little as so few alone. Their
-        # variance is estimated by these few, too.
-        count, n = len(counts.of_groups(values)[0]), max(2.0, counts.effective_number)
-        error *= (n / (n - 1) * max(1, count - 1) / count) ** 0.5
-    half = float(student.ppf(0.975, max(1.0, n - 1))) * error
-    return mean, mean - half, mean + half
+        .. math:: \bar v \pm t_{n-1} \sqrt{\frac{n}{n - 1}
+            \frac{\sum_g w_g^2 (v_g - \bar v)^2}{(\sum_g w_g)^2}}, \qquad
+            n = \frac{(\sum_g w_g)^2}{\sum_g w_g^2}
 
+        A few groups that weigh as much as all others tell as little as so few alone.
 
-def means_of_pairs(values: Tensor, counts: Counts | None) -> Tensor:
-    """Return the mean over pairs of those that are not NaN, ``(n, d)`` to ``(d,)``."""
-    if counts is None:
-        return mean_of_known(values, dim=0)
-    weights = counts.weights.to(values)[:, None] * ~torch.isnan(values)
-    return (weights * values.nan_to_num()).sum(dim=0) / weights.sum(dim=0)
+        Args:
+            values: A number for each pair, shape ``(n,)``. NaN is left out. The
+                interval has no ends if a value is infinite.
+            weight: The weight of each pair; one each if None.
+            group: A number for each pair. The interval takes the means of groups for
+                independent. None if all pairs are.
+            confidence: The probability of the interval.
 
+        Example:
+            >>> print(f"{Estimate.of(torch.tensor([1.0, 2.0, 3.0])):.2f}")
+            2.00 (-0.48 to 4.48)
+        """
+        known = ~values.isnan()
+        values = values[known].double()
+        weight = torch.ones_like(values) if weight is None else weight[known].double()
+        if group is not None:
+            values, weight = group_means(values, weight, group[known])
+        mean = float((weight * values).sum() / weight.sum())
+        if torch.isinf(values).any():
+            return cls(mean, -math.inf, math.inf)
+        if len(values) < 2:
+            return cls(mean)
+        n = max(2.0, effective_number(weight))
+        square = (weight * (values - mean)).square().sum() / weight.sum().square()
+        reach = student.ppf((1 + confidence) / 2, n - 1)
+        half = float(reach * (square * n / (n - 1)).sqrt())
+        return cls(mean, mean - half, mean + half)
 
-def mean_of_known(values: Tensor, dim: int) -> Tensor:
-    """Return the mean of those that are not NaN; NaN if there are none."""
-    return values.nanmean(dim=dim) if values.isnan().any() else values.mean(dim=dim)
+    def __format__(self, spec: str) -> str:
+        low, high = format(self.low, spec), format(self.high, spec)
+        return f"{format(self.mean, spec)} ({low} to {high})"
+
+    def __str__(self) -> str:
+        return format(self, ".3g")
+
+    def __add__(self, number: float) -> "Estimate":
+        return Estimate(self.mean + number, self.low + number, self.high + number)
 
 
 # Whether numbers depend on others -----------------------------------------------------

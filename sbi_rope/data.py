@@ -17,10 +17,11 @@ from sbi_rope.errors import InvalidInputError
 
 __all__ = [
     "MIN_PAIRS_FOR_HOLDOUT",
-    "Counts",
     "Labels",
     "Nodes",
     "Pairs",
+    "effective_number",
+    "group_means",
     "groups_of",
     "groups_to_hold_out",
     "one_of_each_group",
@@ -117,48 +118,6 @@ class Labels:
         return groups_of(torch.cat(known, dim=1)).to(self.y.device)
 
 
-@dataclass(frozen=True, eq=False)
-class Counts:
-    """How many pairs each of some pairs counts as, and which of them belong together.
-
-    Attributes:
-        weights: Shape ``(n,)``.
-        groups: A number for each pair, shape ``(n,)``. Errors are those of means of
-            groups. None if all pairs are independent.
-    """
-
-    weights: Tensor
-    groups: Tensor | None = None
-
-    def __getitem__(self, rows: Tensor) -> "Counts":
-        return _map(lambda value: None if value is None else value[rows], self)
-
-    def of_groups(self, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Return weighted means of the values of each group, and weights of groups.
-
-        Shapes ``(n, ...)`` to ``(G, ...)`` and ``(G,)``.
-        """
-        weights = self.weights.to(values)
-        if self.groups is None:
-            return values, weights
-        numbers, place = self.groups.to(values.device).unique(return_inverse=True)
-        if len(numbers) == len(values):
-            return values, weights
-        total = weights.new_zeros(len(numbers)).index_add(0, place, weights)
-        shares = (weights / total[place]).reshape(-1, *[1] * (values.ndim - 1))
-        sums = values.new_zeros(len(numbers), *values.shape[1:])
-        return sums.index_add(0, place, shares * values), total
-
-    @property
-    def effective_number(self) -> float:
-        r"""The number of independent pairs of equal weight with the same precision.
-
-        .. math:: \Bigl(\sum_g w_g\Bigr)^2 \Big/ \sum_g w_g^2
-        """
-        _, weights = self.of_groups(self.weights.double())
-        return float(weights.sum().square() / weights.square().sum())
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Pairs:
     r"""Real observations with labels; all tensors are on the device of NPE.
@@ -211,10 +170,10 @@ class Pairs:
         return len(self.group.unique())
 
     @property
-    def counts(self) -> Counts:
-        """How much each pair counts where it is scored. A group counts as one pair."""
+    def shared_weight(self) -> Tensor:
+        """The weights of pairs whose group counts as one pair, shape ``(n,)``."""
         _, place, sizes = self.group.unique(return_inverse=True, return_counts=True)
-        return Counts(self.weight / sizes[place], self.group)
+        return self.weight / sizes[place]
 
     def folds(self, num_folds: int, *, seed: int | None = None) -> list[Tensor]:
         """Return the rows of each fold, drawn at random. A group is in one fold."""
@@ -242,7 +201,7 @@ class Pairs:
             num_partial = int((~self.label.is_measured).any(dim=1).sum())
             text += f", {num_noisy} with noise and {num_partial} partial"
         if (self.weight != 1).any():
-            number = Counts(self.weight).effective_number
+            number = effective_number(self.weight)
             text += (
                 f", weighted like {number:.1f} of equal weight, and counted as "
                 f"{float(self.weight.sum()):.3g}"
@@ -312,6 +271,30 @@ def groups_of(theta: Tensor) -> Tensor:
     keys = [tuple(row) if isinstance(row, list) else row for row in rows]
     numbers = {key: number for number, key in enumerate(dict.fromkeys(keys))}
     return torch.tensor([numbers[key] for key in keys], dtype=torch.long)
+
+
+def group_means(values: Tensor, weight: Tensor, group: Tensor) -> tuple[Tensor, Tensor]:
+    """Return weighted means of the values of each group, and the weights of groups.
+
+    Shapes ``(n, ...)``, ``(n,)`` and ``(n,)`` to ``(G, ...)`` and ``(G,)``.
+    """
+    numbers, place = group.to(values.device).unique(return_inverse=True)
+    weight = weight.to(values)
+    if len(numbers) == len(values):
+        return values, weight
+    total = weight.new_zeros(len(numbers)).index_add(0, place, weight)
+    shares = (weight / total[place]).reshape(-1, *[1] * (values.ndim - 1))
+    sums = values.new_zeros(len(numbers), *values.shape[1:])
+    return sums.index_add(0, place, shares * values), total
+
+
+def effective_number(weight: Tensor) -> float:
+    r"""Return the number of equal weights with the precision of these.
+
+    .. math:: \Bigl(\sum_g w_g\Bigr)^2 \Big/ \sum_g w_g^2
+    """
+    weight = weight.double()
+    return float(weight.sum().square() / weight.square().sum())
 
 
 def one_of_each_group(groups: Tensor, *, seed: int) -> Tensor:

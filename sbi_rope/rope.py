@@ -15,7 +15,7 @@ from sbi_rope._random import seeded
 from sbi_rope._sbi import TrainedNPE, embed
 from sbi_rope._standardisation import Standardisation, warn_of_far_entries
 from sbi_rope.coupling import Coupling, SinkhornCoupler
-from sbi_rope.data import Counts, Pairs
+from sbi_rope.data import Pairs, effective_number
 from sbi_rope.density import Coupled, MixturePosterior
 from sbi_rope.discrepancy.correction import tuning_targets
 from sbi_rope.discrepancy.parameters import is_improbable, probability_of_prior
@@ -300,7 +300,7 @@ class RoPE:
             label=label,
         )
         total = float(pairs.weight.sum())
-        if total < Counts(pairs.weight).effective_number / 2:
+        if total < effective_number(pairs.weight) / 2:
             warn_user(
                 f"The weights of {len(pairs)} pairs sum to {total:.3g}, and all "
                 "together count as so many pairs; do not normalise them."

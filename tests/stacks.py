@@ -17,8 +17,8 @@ from sbi_rope.finetuning import FINETUNING
 from sbi_rope.fit import Training
 from sbi_rope.stacking import (
     Candidate,
-    CrossValidation,
     StackData,
+    StackingReport,
     default_candidates,
     stack,
 )
@@ -144,8 +144,8 @@ def stacked(rope: RoPE, x_o: Tensor | None = None, **options: Any) -> StackedPos
         return stack(rope, x_o, **{**DEFAULTS, **options})
 
 
-def validated(rope: RoPE, x_o: Tensor | None = None, **options: Any) -> CrossValidation:
-    return stacked(rope, x_o, **options).report.cross_validation
+def validated(rope: RoPE, x_o: Tensor | None = None, **options: Any) -> StackingReport:
+    return stacked(rope, x_o, **options).report
 
 
 @functools.cache

@@ -23,11 +23,11 @@ LAYERS = [
     "rope discrepancy trainers tasks",
     "stacking diagnosis baselines",
     "plots",
-    "reports",
+    "report",
 ]
 LAYER = {room: k for k, rooms in enumerate(LAYERS) for room in rooms.split()}
 # A method belongs where users look for it. When it is called, it may import from above.
-CALLS_UPWARDS = {("stacking", "reports"), ("_prior", "_sbi")}
+CALLS_UPWARDS = {("stacking", "report"), ("_prior", "_sbi")}
 # Tasks are problems for any method.
 UNKNOWN_TO_TASKS = {"rope", "density", "coupling", "discrepancy", "trainers"}
 # sbi keeps its promises for what these export. One room reaches deeper.

@@ -45,6 +45,6 @@ class Regression(Method):
                 "that is the same in all."
             )
         density = GaussianProcess(
-            pairs.mean, pairs.x, weights=pairs.counts.weights, groups=pairs.group
+            pairs.mean, pairs.x, weights=pairs.shared_weight, groups=pairs.group
         )
         return MixturePosterior(density, self._prior), None

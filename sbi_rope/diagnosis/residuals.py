@@ -9,7 +9,7 @@ from sbi_rope._prior import divisors
 from sbi_rope._progress import progress_bar
 from sbi_rope._sbi import embed
 from sbi_rope._statistics import permutation_test
-from sbi_rope.data import Counts, one_of_each_group
+from sbi_rope.data import group_means, one_of_each_group
 from sbi_rope.diagnosis.report import Finding
 from sbi_rope.diagnosis.simulations import Simulations
 from sbi_rope.fit import without_warning_of_few_pairs
@@ -43,7 +43,7 @@ class CrossFitted:
 
     embedded: Tensor
     targets: Tensor
-    people: Counts | None = None
+    people: Tensor | None = None
 
     @property
     def residuals(self) -> Tensor:
@@ -52,7 +52,9 @@ class CrossFitted:
 
     def of_people(self, values: Tensor) -> Tensor:
         """Return the mean of each person of values of the pairs, ``(n_c, ...)``."""
-        return values if self.people is None else self.people.of_groups(values)[0]
+        if self.people is None:
+            return values
+        return group_means(values, torch.ones(len(values)), self.people)[0]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +111,7 @@ def cross_fit(rope: RoPE, *, num_folds: int, show_progress_bars: bool) -> CrossF
     return CrossFitted(
         embedded=embedded.cpu().double(),
         targets=targets.cpu().double(),
-        people=Counts(torch.ones(len(pairs)), pairs.group.cpu()),
+        people=pairs.group.cpu(),
     )
 
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalEstimator, embedding_of, has_parameters
 from sbi_rope._standardisation import Standardisation
-from sbi_rope.data import Counts, groups_of
+from sbi_rope.data import group_means, groups_of
 from sbi_rope.density.flow import Flow
 from sbi_rope.discrepancy.model import DiscrepancyModel, expected_means
 from sbi_rope.discrepancy.posterior import (
@@ -214,9 +214,9 @@ def surprise(
     variance = 2 * (relative * relative.mT).sum(dim=(1, 2))
     w = torch.ones_like(found) if weights is None else weights.to(found)
     numbers = groups_of(torch.arange(len(z)) if groups is None else groups)
-    counts = Counts(w / numbers.bincount()[numbers].to(w), numbers)
-    excess, w = counts.of_groups(found - expected)
-    variance, _ = counts.of_groups(variance)
+    shared = w / numbers.bincount()[numbers].to(w)
+    excess, w = group_means(found - expected, shared, numbers)
+    variance, _ = group_means(variance, shared, numbers)
     return float((w * excess).sum() / (w.square() * variance).sum().sqrt())
 
 

@@ -115,7 +115,7 @@ def probability_of_prior(pairs: Pairs, prior: Distribution, *, seed: int = 0) ->
     """Return the probability that the parameters of pairs follow the prior."""
     with seeded(seed):
         theta = prior.sample(torch.Size((NUM_FROM_PRIOR,)))
-    theta, weights = theta.to(pairs.theta), pairs.counts.weights
+    theta, weights = theta.to(pairs.theta), pairs.shared_weight
     return learn_parameters(pairs.theta, theta, weights=weights).probability_of_prior
 
 

@@ -1,16 +1,11 @@
-r"""How the metrics call a posterior: in chunks, and never in an unbounded loop.
+"""How metrics call a posterior: in chunks, and never in an unbounded loop.
 
 sbi's ``DirectPosterior`` rejects samples outside the prior, and divides its density by
-the share that it keeps. Both loops go on until enough samples are accepted. If a
-misspecified observation has moved all mass of the flow out of the prior, they never
-end.
-
-The metrics therefore score such a posterior as its network states it. Samples are not
-rejected, and ``log_prob`` is not normalised, although it is still :math:`-\infty`
-outside the prior. Mass outside the prior counts as an error of the posterior.
-
-A posterior that replaces sbi's normalisation by a bounded one, such as those of this
-package, is called as it is.
+the share that it keeps. If a misspecified observation has moved all mass out of the
+prior, these loops never end. Metrics take such a posterior as its network states it:
+samples are not rejected, and ``log_prob`` is not normalised, although it is still minus
+infinity outside the prior. Posteriors that bound the loop, such as those of this
+package, are called as they are.
 """
 
 import warnings
@@ -37,7 +32,6 @@ __all__ = [
     "draw_chunks",
     "draw_samples",
     "evaluate_log_probs",
-    "is_normalised",
     "read_test_set",
 ]
 
@@ -219,16 +213,6 @@ def _is_unbounded(posterior: Any) -> bool:
     if isinstance(posterior, DirectPosterior):
         return not is_bounded(posterior)
     return isinstance(posterior, VectorFieldPosterior)
-
-
-def is_normalised(posterior: Any) -> bool | None:
-    """Tell whether scored densities are corrected for mass outside the prior.
-
-    It is None for ensembles, and for posteriors that are not of sbi or of this package.
-    """
-    if not isinstance(posterior, DirectPosterior):
-        return None
-    return not _is_unbounded(posterior)
 
 
 def _is_unbounded_direct(posterior: Any) -> bool:

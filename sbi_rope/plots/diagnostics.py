@@ -8,7 +8,8 @@ import torch
 
 from sbi_rope.coupling import Coupling
 from sbi_rope.finetuning import History
-from sbi_rope.metrics import CoverageByEstimate, CoverageCurve
+from sbi_rope.metrics import Evaluation
+from sbi_rope.metrics.evaluation import LEVEL, NOMINAL
 from sbi_rope.plots._figures import (
     BLUE,
     GREY,
@@ -20,7 +21,7 @@ from sbi_rope.plots._figures import (
     line_styles,
     new_figure,
 )
-from sbi_rope.settings import check, default_names, names_of
+from sbi_rope.settings import check, names_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,7 +38,7 @@ __all__ = [
 MAX_PANELS = 6
 
 
-def calibration_curves(curves: Mapping[str, CoverageCurve]) -> "Figure":
+def calibration_curves(evaluations: Mapping[str, Evaluation]) -> "Figure":
     r"""Draw the coverage of central credible intervals against their level.
 
     A posterior is under-confident where its curve is above the diagonal, and
@@ -48,22 +49,22 @@ def calibration_curves(curves: Mapping[str, CoverageCurve]) -> "Figure":
     .. math:: \alpha \pm 1.96 \sqrt{\alpha (1 - \alpha) / n}
 
     Args:
-        curves: Coverage curves by method name, from
-            :func:`sbi_rope.metrics.coverage_curve_of`. Their averages over
-            parameters are drawn.
+        evaluations: The scores of each method, by name. Averages over parameters are
+            drawn.
 
     Returns:
         The figure.
     """
-    for name, curve in curves.items():
-        check(f"curves[{name!r}]", curve, CoverageCurve)
+    for name, one in evaluations.items():
+        check(f"evaluations[{name!r}]", one, Evaluation)
     figure, axes = new_figure(7.4, 4.2)
-    count = min(curve.num_observations for curve in curves.values())
+    count = round(min(one.num_independent for one in evaluations.values()))
     label = f"calibrated, 95 % (n = {count})"
     draw_calibrated_band(axes, count, label=label)
-    styles = line_styles(curves)
-    for name, curve in curves.items():
-        axes.plot(curve.levels.cpu(), curve.average.cpu(), label=name, **styles[name])
+    styles = line_styles(evaluations)
+    for name, one in evaluations.items():
+        curve = one.coverage.nanmean(dim=1).cpu()
+        axes.plot(NOMINAL, curve, label=name, **styles[name])
     axes.set_xlabel("credible level")
     axes.set_ylabel("share of true parameters inside")
     note = {"color": GREY, "size": "small", "transform": axes.transAxes}
@@ -75,7 +76,7 @@ def calibration_curves(curves: Mapping[str, CoverageCurve]) -> "Figure":
 
 
 def ranks_by_estimate(
-    found: CoverageByEstimate, *, parameter_names: Sequence[str] | None = None
+    evaluation: Evaluation, *, parameter_names: Sequence[str] | None = None
 ) -> "Figure":
     r"""Draw the ranks of true parameters against the posterior means.
 
@@ -86,16 +87,15 @@ def ranks_by_estimate(
     each. There is a panel for each of the first six parameters.
 
     Args:
-        found: What :func:`sbi_rope.metrics.coverage_by_estimate` returns, or
-            ``posterior.report.by_estimate`` of a stack.
-        parameter_names: A name for each parameter; "theta_1" and so on if None.
+        evaluation: The scores of a posterior, or ``posterior.report.held_out`` of a
+            stack.
+        parameter_names: A name for each parameter; those of the evaluation if None.
 
     Returns:
         The figure.
     """
-    check("found", found, CoverageByEstimate)
-    count = len(found.p_values)
-    names = default_names(count)
+    check("evaluation", evaluation, Evaluation)
+    names, count = evaluation.names, len(evaluation.names)
     if parameter_names is not None:
         names = names_of(parameter_names, count)
     shown = min(count, MAX_PANELS)
@@ -104,7 +104,7 @@ def ranks_by_estimate(
     figure = empty_figure(max(3.2 * columns, 4.2), 2.8 * rows)
     panels = figure.subplots(rows, columns, sharey=True, squeeze=False).flat
     for k, (axes, name) in enumerate(zip(panels, names[:shown], strict=False)):
-        _draw_ranks(axes, found, k)
+        _draw_ranks(axes, evaluation, k)
         axes.set_xlabel(f"estimate of {name}")
         if k % columns == 0:
             axes.set_ylabel("rank of the true parameter")
@@ -113,11 +113,17 @@ def ranks_by_estimate(
     return figure
 
 
-def _draw_ranks(axes: "Axes", found: CoverageByEstimate, k: int) -> None:
-    tail = (1 - found.level) / 2
+def _draw_ranks(axes: "Axes", evaluation: Evaluation, k: int) -> None:
+    found, tail = evaluation.dependence, (1 - LEVEL) / 2
     for low, high in ((0.0, tail), (1 - tail, 1.0)):
         axes.axhspan(low, high, color="0.88", lw=0)
-    axes.plot(found.estimates[:, k], found.ranks[:, k], "o", color=BLUE, ms=3.5)
+    axes.plot(
+        evaluation.estimates[:, k].cpu(),
+        evaluation.ranks[:, k].cpu(),
+        "o",
+        color=BLUE,
+        ms=3.5,
+    )
     left, right = axes.get_xlim()
     edges = [edge for edge in found.edges[k].tolist() if not math.isnan(edge)]
     for edge in edges:

@@ -11,22 +11,17 @@ from sbi_rope.stacking.candidates import (
     default_candidates,
 )
 from sbi_rope.stacking.cross_validation import (
-    CrossValidation,
-    Difference,
-    LearningCurve,
     SetScores,
     StackingWeights,
     stacking_weights,
 )
 from sbi_rope.stacking.data import StackData
 from sbi_rope.stacking.posterior import StackedPosterior
-from sbi_rope.stacking.report import StackingReport
+from sbi_rope.stacking.report import LearningCurve, StackingReport
 from sbi_rope.stacking.stack import stack
 
 __all__ = [
     "Candidate",
-    "CrossValidation",
-    "Difference",
     "DiscrepancyCandidate",
     "FinetunedCandidate",
     "GivenCandidate",

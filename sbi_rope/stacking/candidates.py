@@ -523,7 +523,7 @@ class RegressionCandidate(Settings, Candidate):
             GaussianProcess(
                 pairs.mean[rows],
                 pairs.x[rows],
-                weights=pairs.counts.weights[rows],
+                weights=pairs.shared_weight[rows],
                 groups=pairs.group[rows],
                 net=net,
             )
@@ -585,7 +585,7 @@ class UnlabelledCandidate(Candidate):
         unit = Standardisation(x_s.double())
         chosen = torch.randperm(len(self.x_o))[:MAX_OBSERVATIONS]
         rows = torch.cat(list(versions)).unique()
-        weight = data.pairs.counts.weights[rows]
+        weight = data.pairs.shared_weight[rows]
         is_seen = torch.stack([torch.isin(rows, seen) for seen in versions])
         discrepancies = fit_unlabelled(
             unit(data.pairs.x[rows].double()),

@@ -234,7 +234,7 @@ class StackData:
         return learn_parameters(
             self.pairs.theta[rows],
             self.simulations[0],
-            weights=self.pairs.counts.weights[rows],
+            weights=self.pairs.shared_weight[rows],
         ).probabilities
 
     @torch.no_grad()

@@ -20,7 +20,7 @@ from sbi_rope.sets.conformal import (
     marginal_ends,
     rank_needed,
 )
-from sbi_rope.stacking.cross_validation import CrossValidation, SetScores
+from sbi_rope.stacking.cross_validation import SetScores
 from sbi_rope.stacking.report import StackingReport
 from sbi_rope.tensors import as_batch, check_same_length
 
@@ -134,7 +134,7 @@ class StackedPosterior(MixturePosterior):
         report: StackingReport,
         enable_transform: bool = True,
     ) -> None:
-        weights = report.cross_validation.weights.weights
+        weights = report.weights.weights
         super().__init__(
             mixture_of(versions, weights),
             prior,
@@ -146,8 +146,8 @@ class StackedPosterior(MixturePosterior):
     @property
     def candidate_weights(self) -> dict[str, float]:
         """The weight of each candidate, by name. The weights sum to one."""
-        scores = self.report.cross_validation
-        return dict(zip(scores.names, scores.weights.weights.tolist(), strict=True))
+        weights = self.report.weights.weights.tolist()
+        return dict(zip(self.report.names, weights, strict=True))
 
     @torch.no_grad()
     def candidate_log_probs(self, theta: Tensor, x: Tensor) -> Tensor:
@@ -225,7 +225,7 @@ class HeldOutSets:
 
     def __init__(self, posterior: StackedPosterior) -> None:
         self._posterior = posterior
-        self._validation: CrossValidation = posterior.report.cross_validation
+        self._report = posterior.report
 
     @torch.no_grad()
     def credible_set(self, level: float, x: Tensor, num_samples: int) -> CredibleSet:
@@ -250,7 +250,7 @@ class HeldOutSets:
             x=x,
             draws=torch.stack(draws),
             scores=scores.joint[counted].to(x.device),
-            fold=self._validation.fold[counted].to(x.device),
+            fold=self._report.fold[counted].to(x.device),
             level=level,
         )
         return CredibleSet.of(
@@ -274,7 +274,7 @@ class HeldOutSets:
         scores, guarantee = self._scores(level)
         low, high = [], []
         for number, posterior in enumerate(self._posteriors(scores)):
-            rows = scores.is_counted & (self._validation.fold == number)
+            rows = scores.is_counted & (self._report.fold == number)
             draws = _sample(posterior, x, scores).permute(1, 2, 0)
             of_pairs = scores.marginal[rows].T.to(draws.device)
             ends = marginal_ends(of_pairs.expand(len(x), -1, -1), draws)
@@ -291,17 +291,17 @@ class HeldOutSets:
 
     def _scores(self, level: float) -> tuple[SetScores, Guarantee]:
         """Return the scores and what they promise; raise if there are too few."""
-        scores = self._validation.set_scores
+        scores = self._report.set_scores
         if scores is None:
             raise InvalidInputError(
                 "Expected some exact labels for a set with a guarantee; got "
-                f"{self._validation.labels}."
+                f"{self._report.labels}."
             )
         check_enough(level, len(scores))
         guarantee = Guarantee(
             level=level,
             num_pairs=len(scores),
-            num_folds=self._validation.num_folds,
+            num_folds=self._report.num_folds,
         )
         return scores, guarantee
 

@@ -1,181 +1,246 @@
-"""The report of a stack: whether calibration helped, and how well it is calibrated."""
+"""The report of a stack: what out-of-fold scores say about it."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from os import PathLike
 from typing import Any
 
+import torch
 from torch import Tensor
 
-from sbi_rope._statistics import TwoSampleTest
-from sbi_rope.data import groups_of, one_of_each_group
+from sbi_rope._statistics import Estimate, TwoSampleTest
 from sbi_rope.discrepancy import DiscrepancyReport
-from sbi_rope.metrics import (
-    ACAUCScore,
-    CoverageByEstimate,
-    CoverageCurve,
-    CoverageErrorScore,
-)
-from sbi_rope.metrics.by_estimate import coverage_by_estimate
-from sbi_rope.metrics.calibration import acauc_of, expected_coverage_error_of
-from sbi_rope.sets.conformal import rank_needed
-from sbi_rope.settings import check
+from sbi_rope.metrics import Evaluation
+from sbi_rope.settings import Count, check, one_of
 from sbi_rope.stacking.cross_validation import (
-    CrossValidation,
-    Difference,
-    LearningCurve,
     SetScores,
+    StackingWeights,
+    fold_weights,
+    stacking_weights,
 )
-from sbi_rope.stacking.words import LEVEL, REFERENCES, lines_of
+from sbi_rope.stacking.sections import sections_of, text_of
 
-__all__ = ["StackingReport"]
+__all__ = ["LearningCurve", "StackingReport"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LearningCurve:
+    """The out-of-fold scores of stacks that were trained on fewer pairs.
+
+    Attributes:
+        num_pairs: The numbers of pairs that each was trained on, ascending.
+        evaluations: The scores of each stack, all at the same pairs.
+    """
+
+    num_pairs: tuple[int, ...]
+    evaluations: tuple[Evaluation, ...] = field(repr=False)
+
+    @property
+    def scores(self) -> tuple[Estimate, ...]:
+        """The LPP at each number of pairs. Differences have smaller errors."""
+        return tuple(one.lpp for one in self.evaluations)
+
+    @property
+    def num_labels(self) -> int:
+        """The number of pairs, or of their groups."""
+        group = self.evaluations[0].group
+        return len(self.evaluations[0]) if group is None else len(group.unique())
+
+    def gain(self, num_more: int) -> Estimate:
+        r"""Return how much more labels would add to the score, in nats a pair.
+
+        The curve :math:`s_i(n) = a_i - b_i / n` is fitted to the scores of each
+        hold-out pair i. A stack of n labels is the average of posteriors that were each
+        trained on N of them, as the last point was. With m more labels each is trained
+        on N (n + m) / n, and the gain is
+
+        .. math:: \bar b \left( \frac{1}{N} - \frac{n}{N (n + m)} \right) .
+
+        The interval takes the form of the curve as right.
+
+        Args:
+            num_more: m, the number of labels, or of groups, to add.
+
+        Returns:
+            The gain; NaN if the curve has a single point or a score is not finite.
+
+        Raises:
+            InvalidInputError: If the number is below 1.
+        """
+        check("num_more", num_more, Count)
+        scores = torch.stack([one.log_prob for one in self.evaluations])
+        if len(scores) < 2 or not torch.isfinite(scores).all():
+            return Estimate(math.nan)
+        inverse = torch.tensor(self.num_pairs).to(scores).reciprocal()
+        centred = inverse - inverse.mean()
+        slopes = -(centred @ scores) / centred.square().sum()
+        last, n = self.num_pairs[-1], self.num_labels
+        scale = 1 / last - n / (last * (n + num_more))
+        return self.evaluations[0].mean(scale * slopes)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StackingReport:
-    """How well a stack predicts held-out pairs, which methods it uses, and coverage.
+    """How well a stack predicts hold-out pairs, what it is made of, and coverage.
 
-    All numbers are computed on pairs that the candidates were not trained on. The
-    weights of the stack that scores a pair are fitted to the scores of the other folds.
+    A candidate is scored at pairs of a fold by the version that was trained without
+    this fold, and the stack at these pairs has the weights fitted to the other folds.
+    With few pairs these weights still depend a little on the labels of the fold. What
+    is deployed is the average of all versions. Print the report for what it found.
 
-    Make a report with :meth:`of`, which computes all numbers once. Printing a report
-    computes nothing.
+    With labels that are not exact, scores are log densities of the labels, and ranks
+    are those of the labels, NaN where a parameter was not measured. Scores of labels
+    given as draws are relative to the prior, and their ranks are not known.
 
     Attributes:
-        cross_validation: The scores of all candidates and of the stack.
+        names: The names of the K candidates.
+        families: The method of each candidate.
+        log_scores: The log density of the true parameters under each candidate, shape
+            ``(n, K)``, not corrected for mass outside the prior.
+        fold: The fold of each pair, shape ``(n,)``.
+        num_trained_on: The mean number of pairs that the candidates were trained on.
+        held_out: The scores of the stack at all pairs. Its density is normalised inside
+            the support of the prior.
+        set_scores: The scores that sets with a guarantee are made from; None if no
+            label is exact.
+        score_errors: The Monte-Carlo error of each score, if labels are not exact.
+        labels: What is known of labels that are not exact, or weighted, in words.
         learning_curve: The learning curve of the stack, if it was asked for.
-        score: Mean held-out log score of the stack's normalised density, in nats a
-            pair with theta in its own units, and its standard error.
-        score_z: The same with theta in standard deviations of the prior. Scores of
-            pairs differ by a constant, the sum of the logs of these standard deviations
-            of the parameters that were measured. NaN if the prior has none.
-        comparable_score: The same without correction for leakage, so that it can be
-            compared with the scores of the candidates.
-        gains: How much higher the stack scores than the candidates "prior" and "NPE",
-            by name, if these are among the candidates. Compared with the prior the
-            stack is normalised, as it is deployed. Compared with NPE, whose leakage is
-            not corrected, it is not.
-        family_weights: The weight of each method, summed over its settings, from the
-            largest to the smallest.
-        acauc: ACAUC of the stack's central intervals.
-        coverage_error: Expected coverage error of the stack's central intervals.
-        share_inside: Share of the parameters inside their 90 % intervals.
-        joint_sets: Share of the pairs that are in their 90 % sets of highest density,
-            and the level of such sets that are as large as those of 90 % with a
-            guarantee. None if there are too few pairs for it.
-        batch: How ``x_o`` compares with the observations of the pairs; None without
-            it, or with fewer than five of either.
-        discrepancy: What the pairs say about each entry of x. None if the stack has no
-            discrepancy among its candidates, or x is not a short vector.
-        provenance: How it was made, in words: the seed, the seconds, the simulator
-            calls, when it was finished, and the versions of packages.
-        acauc_of_parameters: ACAUC of each parameter by itself. The intervals are so
-            wide that those of d calibrated parameters all hold 0 in at least 95 % of
-            the cases (Bonferroni).
-        by_estimate: Whether the coverage of the stack's 90 % intervals depends on the
-            estimate.
+        batch: How ``x_o`` compares with the observations of the pairs; None without it,
+            or with fewer than five of either.
+        discrepancy: What the pairs say about each entry of x. None if no candidate has
+            a discrepancy, or x is not a short vector.
         probability_of_prior: The probability that the parameters of the pairs were
-            drawn from the prior, see :func:`~sbi_rope.discrepancy.learn_parameters`;
-            None if it is not known.
+            drawn from the prior, see :func:`~sbi_rope.discrepancy.learn_parameters`.
         keep_prior: The names of the candidates that do not learn from the pairs how
             parameters are distributed.
-        parameter_names: One name for each parameter; None if they have none.
+        provenance: How it was made, in words: seed, seconds, simulator calls, versions.
     """
 
-    cross_validation: CrossValidation
-    learning_curve: LearningCurve | None
-    score: tuple[float, float]
-    comparable_score: tuple[float, float]
-    gains: dict[str, Difference]
-    family_weights: dict[str, float]
-    acauc: ACAUCScore
-    coverage_error: CoverageErrorScore
-    share_inside: float
-    score_z: tuple[float, float]
-    acauc_of_parameters: tuple[ACAUCScore, ...]
-    by_estimate: CoverageByEstimate
-    joint_sets: tuple[float, float] | None = None
+    names: tuple[str, ...]
+    families: tuple[str, ...]
+    log_scores: Tensor = field(repr=False)
+    fold: Tensor = field(repr=False)
+    num_trained_on: int
+    held_out: Evaluation
+    set_scores: SetScores | None = field(default=None, repr=False)
+    score_errors: Tensor | None = field(default=None, repr=False)
+    labels: str = ""
+    learning_curve: LearningCurve | None = None
     batch: TwoSampleTest | None = None
     discrepancy: DiscrepancyReport | None = None
-    provenance: dict[str, str] = field(default_factory=dict, repr=False)
     probability_of_prior: float | None = None
     keep_prior: tuple[str, ...] = ()
-    parameter_names: tuple[str, ...] | None = None
+    provenance: dict[str, str] = field(default_factory=dict, repr=False)
 
-    @classmethod
-    def of(
-        cls,
-        cross_validation: CrossValidation,
-        learning_curve: LearningCurve | None = None,
-        **others: Any,
-    ) -> "StackingReport":
-        """Compute the report of a stack.
-
-        Args:
-            cross_validation: The scores of its candidates.
-            learning_curve: The learning curve of the stack, if it was asked for.
-            **others: The attributes that do not follow from these scores.
-        """
-        check("cross_validation", cross_validation, CrossValidation)
-        check("learning_curve", learning_curve, LearningCurve | None)
-        scores, levels = cross_validation, cross_validation.levels
-        score, error = scores.mean_and_error(scores.stack_scores)
-        return cls(
-            cross_validation=scores,
-            learning_curve=learning_curve,
-            score=(score, error),
-            score_z=scores.mean_and_error(
-                scores.in_units_of_prior(scores.stack_scores)
-            ),
-            comparable_score=scores.mean_and_error(scores.scores_of("stack")),
-            gains={
-                name: scores.gain_over_prior()
-                if name == "prior"
-                else scores.difference("stack", name)
-                for name in REFERENCES
-                if name in scores.names
-            },
-            family_weights=_family_weights(scores),
-            acauc=acauc_of(levels, scores.counts),
-            coverage_error=expected_coverage_error_of(levels, scores.counts),
-            share_inside=float(scores.coverage.average[round(100 * LEVEL) - 1]),
-            joint_sets=_joint_sets(scores.set_scores),
-            acauc_of_parameters=_acauc_of_parameters(scores),
-            by_estimate=_by_estimate(scores),
-            **others,
-        )
+    def __len__(self) -> int:
+        return len(self.fold)
 
     @property
-    def learns_prior(self) -> bool:
-        """Whether a candidate learns how parameters are distributed."""
-        return len(self.keep_prior) < len(self.cross_validation.names)
+    def num_folds(self) -> int:
+        """The number of folds."""
+        return int(self.fold.max()) + 1
+
+    @cached_property
+    def weights(self) -> StackingWeights:
+        """The weights of the candidates, fitted to all pairs."""
+        return stacking_weights(self.log_scores, pair_weights=self.held_out.weight)
+
+    @property
+    def family_weights(self) -> dict[str, float]:
+        """The weight of each method, summed over its settings, the largest first."""
+        totals = dict.fromkeys(self.families, 0.0)
+        for family, weight in zip(
+            self.families, self.weights.weights.tolist(), strict=True
+        ):
+            totals[family] += weight
+        return dict(sorted(totals.items(), key=lambda item: -item[1]))
+
+    @cached_property
+    def comparable_scores(self) -> Tensor:
+        """The scores of the stack without correction for mass outside the prior, (n,).
+
+        Those of the candidates are not corrected either: for NPE on real data the
+        correction may not end.
+        """
+        weights = fold_weights(self.log_scores, self.fold, self.held_out.weight)
+        return torch.logsumexp(self.log_scores + weights[self.fold].log(), dim=1)
+
+    def scores_of(self, name: str) -> Tensor:
+        """Return the log scores of a candidate, or of "stack", shape ``(n,)``.
+
+        They are not corrected for mass outside the prior.
+
+        Raises:
+            InvalidInputError: If there is no candidate of that name.
+        """
+        if name == "stack":
+            return self.comparable_scores
+        check("name", name, one_of((*self.names, "stack")))
+        return self.log_scores[:, self.names.index(name)]
+
+    def difference(self, name: str, other: str) -> Estimate:
+        """Return by how much a candidate, or "stack", scores higher than another."""
+        return self._gain(self.scores_of(name) - self.scores_of(other))
+
+    @property
+    def gains(self) -> dict[str, Estimate]:
+        """How much higher the stack scores than the candidates "prior" and "NPE".
+
+        Compared with the prior the stack is normalised, as it is deployed. Compared
+        with NPE, which is not, it is not.
+        """
+        gains = {}
+        if "NPE" in self.names:
+            gains["NPE"] = self.difference("stack", "NPE")
+        if "prior" in self.names:
+            above = self.held_out.log_prob - self.scores_of("prior")
+            gains["prior"] = self._gain(above)
+        return gains
+
+    def _gain(self, difference: Tensor) -> Estimate:
+        # Where both scores are minus infinity, neither candidate is better.
+        difference = difference.nan_to_num(nan=0.0, posinf=torch.inf, neginf=-torch.inf)
+        return self.held_out.mean(difference)
 
     @property
     def score_of_prior_kept(self) -> float | None:
         """The best score of a candidate that does not learn the prior; None if none."""
-        scores = self.cross_validation
-        found = [
-            scores.mean_and_error(scores.scores_of(name))[0] for name in self.keep_prior
-        ]
+        found = [self.held_out.mean(self.scores_of(k)).mean for k in self.keep_prior]
         return max(found, default=None)
 
     @property
-    def levels(self) -> Tensor:
-        """The levels of held-out pairs, see :class:`CrossValidation`."""
-        return self.cross_validation.levels
-
-    @property
-    def coverage(self) -> CoverageCurve:
-        """Coverage of the stack's central intervals on held-out pairs."""
-        return self.cross_validation.coverage
+    def monte_carlo_error(self) -> float:
+        """The error of the mean score that comes from labels not being exact."""
+        if self.score_errors is None:
+            return 0.0
+        weight = self.held_out.weight
+        weight = torch.ones_like(self.score_errors) if weight is None else weight
+        return float((weight * self.score_errors).norm() / weight.sum())
 
     def as_rows(self) -> list[dict[str, Any]]:
-        """Return a row for each candidate, the best held-out score first.
+        """Return a row for each candidate, the best out-of-fold score first.
 
-        The key "score" is the score with theta in its own units, and "score_z" that
-        with theta in standard deviations of the prior. Both are in nats a pair.
+        The key "score" is the LPP with theta in its own units, and "score_z" that with
+        theta in standard deviations of the prior. Both have a "low" and a "high" end.
         """
-        rows = self.cross_validation.as_rows()
+        rows, unit = [], self.held_out.log_unit
+        for name, family, weight, scores in zip(
+            self.names,
+            self.families,
+            self.weights.weights.tolist(),
+            self.log_scores.unbind(dim=1),
+            strict=True,
+        ):
+            row: dict[str, Any] = {"candidate": name, "family": family}
+            row["weight"] = weight
+            for key, values in (("score", scores), ("score_z", scores + unit)):
+                found = self.held_out.mean(values)
+                row |= {key: found.mean, f"{key}_low": found.low}
+                row[f"{key}_high"] = found.high
+            rows.append(row)
         return sorted(rows, key=lambda row: -row["score"])
 
     def to_html(
@@ -188,9 +253,8 @@ class StackingReport:
     ) -> None:
         """Write the report as one HTML file that can be sent to somebody.
 
-        It is for readers who do not know this package. It holds the scores, weights,
-        coverage and discrepancies with pictures, and how the stack was made. It needs
-        no other file, no script and no network.
+        It says what printing says, with tables and pictures, and what the words mean.
+        It needs no other file, no script and no network.
 
         Args:
             path: The file. Its folder is made if there is none. A report of this
@@ -198,17 +262,17 @@ class StackingReport:
             diagnosis: What :func:`sbi_rope.diagnose` says about a batch, if the report
                 should hold it.
             parameter_names: A name for each parameter. If None, those that ``RoPE`` was
-                given, those of the diagnosis, or "theta_1" and so on.
+                given, or "theta_1" and so on.
             x_names: A name for each entry of x; "x[0]" and so on if None.
 
         Raises:
-            InvalidInputError: If an argument has the wrong type, the names do not fit,
-                or the path is a folder or a file of something else.
+            InvalidInputError: If the names do not fit, or the path is a folder or a
+                file of something else.
         """
         # This room draws with `plots`, which draws this report: it is above both.
-        from sbi_rope.reports import write_stacking_report
+        from sbi_rope.report import write_html
 
-        write_stacking_report(
+        write_html(
             self,
             path,
             diagnosis=diagnosis,
@@ -217,35 +281,4 @@ class StackingReport:
         )
 
     def __str__(self) -> str:
-        return "\n".join(lines_of(self))
-
-
-def _acauc_of_parameters(scores: CrossValidation) -> tuple[ACAUCScore, ...]:
-    columns = scores.levels.split(1, dim=1)
-    confidence = 1 - 0.05 / len(columns)
-    return tuple(
-        acauc_of(column, scores.counts, confidence=confidence) for column in columns
-    )
-
-
-def _by_estimate(scores: CrossValidation) -> CoverageByEstimate:
-    chosen = None
-    if scores.groups is not None:
-        chosen = one_of_each_group(groups_of(scores.groups), seed=0)
-    return coverage_by_estimate(
-        scores.ranks, scores.estimates, scores.counts, chosen=chosen, level=LEVEL
-    )
-
-
-def _joint_sets(scores: SetScores | None) -> tuple[float, float] | None:
-    if scores is None or rank_needed(LEVEL, len(scores)) > len(scores):
-        return None
-    return scores.share_held(LEVEL), scores.level_needed(LEVEL)
-
-
-def _family_weights(scores: CrossValidation) -> dict[str, float]:
-    totals: dict[str, float] = {}
-    weights = scores.weights.weights.tolist()
-    for family, weight in zip(scores.families, weights, strict=True):
-        totals[family] = totals.get(family, 0.0) + weight
-    return dict(sorted(totals.items(), key=lambda item: -item[1]))
+        return text_of(self, sections_of(self))

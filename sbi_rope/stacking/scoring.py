@@ -9,23 +9,20 @@ import torch
 from torch import Tensor
 
 from sbi_rope._random import seeded
-from sbi_rope.data import Counts, Labels, Nodes, groups_of, one_of_each_group
+from sbi_rope.data import Labels, Nodes, groups_of, one_of_each_group
 from sbi_rope.density import Density, Mixture, MixturePosterior
 from sbi_rope.density.base import without_nan
 from sbi_rope.errors import SamplingError, warn_user
 from sbi_rope.labels import nodes_of, reference_of
-from sbi_rope.metrics.by_estimate import estimates_and_ranks
-from sbi_rope.metrics.calibration import central_levels, count_ranks, random_ranks
-from sbi_rope.metrics.calls import draw_chunks, draw_samples
+from sbi_rope.metrics import Evaluation, draw_samples
+from sbi_rope.metrics.calls import draw_chunks
+from sbi_rope.metrics.evaluation import estimates_and_ranks
 from sbi_rope.sets.conformal import joint_scores, marginal_scores
 from sbi_rope.stacking.candidates import Candidate
-from sbi_rope.stacking.cross_validation import (
-    CrossValidation,
-    SetScores,
-    fold_weights,
-)
+from sbi_rope.stacking.cross_validation import SetScores, fold_weights
 from sbi_rope.stacking.data import StackData
 from sbi_rope.stacking.posterior import fold_posterior
+from sbi_rope.stacking.report import StackingReport
 
 __all__ = ["score_folds"]
 
@@ -38,14 +35,13 @@ NUM_REFERENCES, NUM_NODES = 200, 512
 
 
 class FoldScores(NamedTuple):
-    """Scores of a stack at held-out pairs, as in ``CrossValidation``, ``SetScores``.
+    """Scores of a stack at hold-out pairs, as in ``Evaluation`` and ``SetScores``.
 
     ``log_prob`` is normalised inside the prior's support. Its Monte-Carlo ``errors``
     are zero for exact labels.
     """
 
     log_prob: Tensor
-    levels: Tensor
     estimates: Tensor
     ranks: Tensor
     joint: Tensor
@@ -76,7 +72,7 @@ def score_folds(
     *,
     num_training_folds: int,
     seed: int,
-) -> CrossValidation:
+) -> StackingReport:
     """Score what was trained without each fold on the pairs of the fold.
 
     Args:
@@ -86,7 +82,7 @@ def score_folds(
         num_training_folds: The number of folds that each was trained on.
         seed: Seed of the draws at the held-out pairs.
     """
-    pairs, weight = data.pairs, data.pairs.counts.weights
+    pairs, weight = data.pairs, data.pairs.shared_weight
     of_folds = [[one[k] for one in fitted] for k in range(len(data.folds))]
     log_scores = weight.new_empty(len(data), len(fitted))
     fold = torch.empty_like(pairs.group)
@@ -96,10 +92,7 @@ def score_folds(
             k,
             of_labels[k].nodes.log_mean(of_labels[k].log_q),
         )
-    counts = None
-    if bool((weight != 1).any()) or pairs.num_groups < len(pairs):
-        counts = Counts(weight, pairs.group if pairs.num_groups < len(pairs) else None)
-    weights = fold_weights(log_scores, fold, counts)
+    weights = fold_weights(log_scores, fold, weight)
     of_stacks = [
         _score_fold(data, of_folds[k], weights[k], of_labels[k], k, seed=seed)
         for k in range(len(data.folds))
@@ -109,29 +102,32 @@ def score_folds(
         *(torch.cat(parts)[order] for parts in zip(*of_stacks, strict=True))
     )
     is_simple = pairs.are_exact and bool((pairs.weight == 1).all())
-    scores = CrossValidation(
+    report = StackingReport(
         names=tuple(candidate.name for candidate in candidates),
         families=tuple(one.family or one.name for one in candidates),
         log_scores=log_scores,
         fold=fold,
         num_trained_on=len(fold) * num_training_folds // len(data.folds),
-        stack_scores=of_stack.log_prob,
-        levels=of_stack.levels,
-        estimates=of_stack.estimates,
-        ranks=of_stack.ranks,
+        held_out=Evaluation(
+            log_prob=of_stack.log_prob,
+            ranks=of_stack.ranks,
+            estimates=of_stack.estimates,
+            log_unit=_log_unit(data),
+            weight=weight,
+            group=pairs.group if pairs.num_groups < len(pairs) else None,
+            parameter_names=data.rope.parameter_names,
+        ),
         set_scores=_set_scores(data, of_stack, weights, seed=seed),
-        log_unit=_log_unit(data),
-        counts=counts,
         score_errors=None if pairs.are_exact else of_stack.errors,
         labels="" if is_simple else str(pairs),
     )
-    if not scores.weights.converged:
+    if not report.weights.converged:
         warn_user(
-            "The weights of the stack have not converged: the held-out score could "
-            f"be better by up to {scores.weights.gap / float(weight.sum()):.3f} nats a "
+            "The weights of the stack have not converged: the out-of-fold score could "
+            f"be better by up to {report.weights.gap / float(weight.sum()):.3f} nats a "
             "pair. Leave out candidates that are nearly the same."
         )
-    return scores
+    return report
 
 
 def _score_fold(
@@ -192,7 +188,7 @@ def _score_exact(
     posterior: MixturePosterior, theta: Tensor, x: Tensor, *, seed: int
 ) -> FoldScores:
     """Score the posterior of a fold at labels that are exact."""
-    log_prob, levels, joint, marginal, by_estimate = [], [], [], [], []
+    log_prob, joint, marginal, found = [], [], [], []
     with seeded(seed):
         chunks = draw_chunks(
             posterior,
@@ -203,7 +199,6 @@ def _score_exact(
             show=False,
         )
         for rows, draws in chunks:
-            levels.append(central_levels(random_ranks(draws, theta[rows])))
             # In one call, because the mass inside the support is estimated in each.
             log_probs = posterior.log_prob_batched(
                 torch.cat([theta[rows][None], draws]), x[rows]
@@ -212,11 +207,10 @@ def _score_exact(
             joint.append(joint_scores(log_probs[:1].T, log_probs[1:].T)[:, 0])
             columns = draws.permute(1, 2, 0)
             marginal.append(marginal_scores(theta[rows, :, None], columns)[..., 0])
-            by_estimate.append(estimates_and_ranks(draws, theta[rows]))
-    estimates, ranks = (torch.cat(parts) for parts in zip(*by_estimate, strict=True))
+            found.append(estimates_and_ranks(draws, theta[rows]))
+    estimates, ranks = (torch.cat(parts) for parts in zip(*found, strict=True))
     return FoldScores(
         log_prob=torch.cat(log_prob),
-        levels=torch.cat(levels).to(theta),
         estimates=estimates.to(theta),
         ranks=ranks.to(theta),
         joint=torch.cat(joint),
@@ -273,9 +267,9 @@ def _score_labels(
 ) -> FoldScores:
     """Score the posterior of a fold at labels that are not all exact.
 
-    Draws of the posterior get the noise of a label, so that its levels are uniform if
-    the posterior is calibrated. They test it less the larger the noise is. Levels and
-    ranks are NaN for parameters that were not measured, and for labels given as draws.
+    Draws of the posterior get the noise of a label, so that its ranks are uniform if
+    the posterior is calibrated. They test it less the larger the noise is. Ranks are
+    NaN for parameters that were not measured, and for labels given as draws.
     Scores of sets are NaN where a label is not exact: a set that holds a label need not
     hold the parameters.
     """
@@ -286,11 +280,7 @@ def _score_labels(
         samples = draw_samples(posterior, x, num_samples=NUM_SAMPLES)
         measured = samples + std.to(samples) * torch.randn_like(samples)
     known = labels.is_measured & (not labels.are_drawn)
-    levels = central_levels(count_ranks(measured, labels.y)).to(labels.y)
     estimates, ranks = estimates_and_ranks(measured, labels.y)
-    levels, ranks = (
-        one.to(labels.y).where(known, torch.nan) for one in (levels, ranks)
-    )
     marginal = torch.full_like(labels.y, torch.nan)
     joint = torch.full_like(log_prob, torch.nan)
     if (exact := labels.is_exact).any():
@@ -298,9 +288,8 @@ def _score_labels(
         joint[exact], marginal[exact] = at_exact.joint, at_exact.marginal.to(marginal)
     return FoldScores(
         log_prob=log_prob - log_mass,
-        levels=levels,
         estimates=estimates.to(labels.y),
-        ranks=ranks,
+        ranks=ranks.to(labels.y).where(known, torch.nan),
         joint=joint,
         marginal=marginal,
         errors=errors,

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import datetime, timezone
 from importlib.metadata import version
 from typing import Annotated, Any
@@ -26,10 +27,9 @@ from sbi_rope.stacking.candidates import (
     chosen_candidates,
     left_out,
 )
-from sbi_rope.stacking.cross_validation import CrossValidation, LearningCurve
 from sbi_rope.stacking.data import NUM_FOLDS, StackData, draw_seeds
 from sbi_rope.stacking.posterior import StackedPosterior, Versions
-from sbi_rope.stacking.report import StackingReport
+from sbi_rope.stacking.report import LearningCurve, StackingReport
 from sbi_rope.stacking.scoring import score_folds
 
 __all__ = ["stack"]
@@ -128,7 +128,7 @@ def stack(
     stacked = chosen_candidates(candidates, data, x_o)
     batch = None if x_o is None else _compare_batch(data, x_o)
     numbers = range(len(data.folds))
-    points: list[CrossValidation] = []
+    points: list[StackingReport] = []
     seconds = dict.fromkeys((candidate.name for candidate in stacked), 0.0)
     fitted: list[list[Density]] = []
     for count in _numbers_of_folds(len(numbers), curve=learning_curve):
@@ -148,17 +148,21 @@ def stack(
         points.append(
             score_folds(data, stacked, found, num_training_folds=count, seed=of_scores)
         )
-    scores = points[0]
-    report = StackingReport.of(
-        scores,
-        LearningCurve.of(points[::-1]) if learning_curve else None,
+    curve = None
+    if learning_curve:
+        curve = LearningCurve(
+            num_pairs=tuple(point.num_trained_on for point in points[::-1]),
+            evaluations=tuple(point.held_out for point in points[::-1]),
+        )
+    report = replace(
+        points[0],
+        learning_curve=curve,
         batch=batch,
         discrepancy=_discrepancy(stacked, data),
         probability_of_prior=probability_of_prior(
             data.pairs, data.prior, seed=data.seed
         ),
         keep_prior=tuple(one.name for one in stacked if not one.learns_prior),
-        parameter_names=rope.parameter_names,
         provenance={
             "seed": "none, so that a repetition differs" if seed is None else str(seed),
             "seconds": f"{time.perf_counter() - start:.0f}",

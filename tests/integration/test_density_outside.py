@@ -119,7 +119,7 @@ def test_parameters_that_were_not_measured_do_not_stop_fine_tuning() -> None:
     x = measured(theta)
     theta[::3, 0] = torch.nan
     posterior = stacked(theta, x, "NPE", "fine-tuned NPE")
-    scores = posterior.report.cross_validation
+    scores = posterior.report
     gain = scores.scores_of("fine-tuned NPE") - scores.scores_of("NPE")
     assert gain.mean() > 0.1
 

@@ -114,7 +114,7 @@ def test_a_shift_that_the_pairs_show_is_an_alarm_where_nothing_has_learned_it(
 ) -> None:
     report = stack.report
     for other in (
-        replace(report, keep_prior=report.cross_validation.names),
+        replace(report, keep_prior=report.names),
         replace(report, probability_of_prior=0.3),
         replace(report, probability_of_prior=None),
     ):

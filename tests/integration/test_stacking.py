@@ -92,7 +92,7 @@ def test_every_pair_is_held_out_once_and_trains_all_other_folds(
 @pytest.mark.medium
 def test_scores_are_the_densities_of_the_versions_without_the_fold() -> None:
     posterior = the_stack()
-    scores, (theta, x) = posterior.report.cross_validation, problem(NUM_PAIRS, seed=1)
+    scores, (theta, x) = posterior.report, problem(NUM_PAIRS, seed=1)
     for name, versions in zip(scores.names, posterior.versions, strict=True):
         for number in range(scores.num_folds):
             rows = scores.fold == number
@@ -104,7 +104,7 @@ def test_scores_are_the_densities_of_the_versions_without_the_fold() -> None:
 @pytest.mark.medium
 def test_the_stack_that_scores_a_fold_is_weighted_by_the_others() -> None:
     posterior = the_stack()
-    scores, (theta, x) = posterior.report.cross_validation, problem(NUM_PAIRS, seed=1)
+    scores, (theta, x) = posterior.report, problem(NUM_PAIRS, seed=1)
     for number in range(scores.num_folds):
         rows = scores.fold == number
         weights = stacking_weights(scores.log_scores[~rows]).weights
@@ -115,10 +115,10 @@ def test_the_stack_that_scores_a_fold_is_weighted_by_the_others() -> None:
         mass = without.leakage_correction(x[rows])
         expected = mixed - mass.log()
         error = 6 * problems.error_of_mass(mass)
-        assert ((scores.stack_scores[rows] - expected).abs() < error + 1e-5).all()
+        assert ((scores.held_out.log_prob[rows] - expected).abs() < error + 1e-5).all()
         samples = without.sample_batched((400,), x[rows], **QUIET)
         below = (samples < theta[rows]).double().mean(dim=0)
-        found = scores.levels[rows].double()
+        found = scores.held_out.levels[rows].double()
         # Four standard errors of 40 samples, two-sided.
         assert torch.allclose(found, (2 * below - 1).abs(), atol=0.65)
         assert ((found >= 0) & (found <= 1)).all()
@@ -142,12 +142,12 @@ def test_the_stack_of_each_fold_is_normalised_by_its_own_mass(
     box = torch.full((NUM_PAIRS,), math.log(0.25), dtype=torch.double)
     raw = -2 * (2 * torch.stack(widths)[:, 0]).log().double()[scores.fold]
     assert torch.allclose(scores.log_scores[:, 0], raw, atol=1e-5)
-    assert torch.allclose(scores.stack_scores, box, atol=0.7)
-    assert float((scores.stack_scores - box).mean()) == pytest.approx(0.0, abs=0.15)
+    assert torch.allclose(scores.held_out.log_prob, box, atol=0.7)
+    assert float((scores.held_out.log_prob - box).mean()) == pytest.approx(0.0, abs=0.15)
 
 
 def test_rows_of_the_table_are_mean_error_and_weight_of_each_candidate() -> None:
-    scores = small_stack().report.cross_validation
+    scores = small_stack().report
     rows = scores.as_rows()
     assert [row["candidate"] for row in rows] == list(scores.names)
     assert [row["family"] for row in rows] == list(scores.families)
@@ -156,12 +156,13 @@ def test_rows_of_the_table_are_mean_error_and_weight_of_each_candidate() -> None
         assert row["weight"] == float(scores.weights.weights[k])
         assert row["score"] == pytest.approx(float(column.mean()))
         error = float((column - column.mean()).square().sum() / (19 * 20)) ** 0.5
-        assert row["standard_error"] == pytest.approx(error, abs=1e-12)
-    assert math.isfinite(acauc_of(scores.levels).value)
+        half = (row["score_high"] - row["score_low"]) / 2
+        assert half == pytest.approx(2.093 * error, rel=1e-3, abs=1e-12)
+    assert math.isfinite(scores.held_out.acauc.mean)
 
 
 def test_differences_are_means_over_pairs_with_the_interval_of_students_t() -> None:
-    scores = small_stack().report.cross_validation
+    scores = small_stack().report
     for name, other in (("NPE", "prior"), ("stack", "prior"), ("NPE", "NPE")):
         pairs = scores.scores_of(name) - scores.scores_of(other)
         found, error = scores.difference(name, other), sem(pairs)
@@ -177,7 +178,7 @@ def test_differences_are_means_over_pairs_with_the_interval_of_students_t() -> N
 def test_the_density_is_the_weighted_sum_of_averages_of_versions() -> None:
     x, theta = observed(), problems.box(2).sample((NUM_OBSERVED,))
     posterior = the_stack()
-    scores = posterior.report.cross_validation
+    scores = posterior.report
     expected = stacking_weights(scores.log_scores).weights
     assert list(posterior.candidate_weights.values()) == expected.tolist()
     assert list(posterior.candidate_weights) == list(scores.names)
@@ -320,7 +321,7 @@ def test_every_family_can_be_stacked(family: str, embedding: str) -> None:
     x = problems.simulate(theta) + 0.4
     rope = rope_of((theta[:8], x[:8]), family=family, embedding=embedding)
     posterior = stacked(rope)
-    assert posterior.report.cross_validation.log_scores.isfinite().all()
+    assert posterior.report.log_scores.isfinite().all()
     assert posterior.log_prob_batched(theta[8:], x[8:]).isfinite().all()
     samples = posterior.sample_batched((3,), x[8:], **QUIET)
     assert samples.shape == (3, 22, theta.shape[1])
@@ -390,7 +391,7 @@ def test_a_stack_can_use_stored_simulations() -> None:
     for count in (10, 200):
         rope = rope_of(simulations=(theta[:count], x[:count]))
         posterior = stacked(rope)
-        scores = posterior.report.cross_validation.log_scores
+        scores = posterior.report.log_scores
         assert scores.isfinite().all(), count
         samples = posterior.sample_batched((2,), observed(10), **QUIET)
         assert samples.isfinite().all(), count
@@ -411,10 +412,10 @@ def test_few_pairs_are_held_out_one_by_one() -> None:
             # How many pairs a version is trained on is no choice of the user.
             warnings.filterwarnings("error", message="Only .* none is held out")
             posterior = stacked(rope_of(problem(num_pairs, seed=1)))
-        scores = posterior.report.cross_validation
+        scores = posterior.report
         assert scores.num_folds == num_pairs
         assert scores.log_scores.isfinite().all()
-        assert scores.stack_scores.isfinite().all()
+        assert scores.held_out.log_prob.isfinite().all()
         assert math.isclose(sum(posterior.candidate_weights.values()), 1.0)
         assert posterior.sample((2,), x=observed(1), **QUIET).shape == (2, 2)
         assert str(posterior.report)
@@ -476,7 +477,7 @@ def test_densities_that_are_given_are_stacked_as_they_are() -> None:
         *("older", "Wide", "StackedPosterior", "prior")
     ]
     theta, x = problem(NUM_PAIRS, seed=1)
-    scores = posterior.report.cross_validation
+    scores = posterior.report
     another.posterior_estimator.eval()
     for name, expected in (
         ("older", unnormalised(another, theta, x)[0]),

@@ -99,7 +99,7 @@ def test_held_out_scores_promise_no_more_than_test_observations_give() -> None:
         theta_o, x_o = labelled(300, gaussian.real_process)
         theta, x = labelled(30, gaussian.real_process)
         posterior = gaussian_stack(theta, x, seed=seed)
-        promised.append(posterior.report.cross_validation.stack_scores)
+        promised.append(posterior.report.held_out.log_prob)
         given.append(score_of(posterior, theta_o, x_o))
     gap = torch.cat(promised).mean() - torch.cat(given).mean()
     error = math.hypot(*(_error(torch.cat(scores)) for scores in (promised, given)))
@@ -114,7 +114,7 @@ def _error(scores: Tensor) -> float:
 
 def test_a_stack_is_calibrated_on_pairs_that_it_has_not_seen() -> None:
     posterior = gaussian_stack(*labelled(150, gaussian.real_process))
-    levels = posterior.report.levels.double()
+    levels = posterior.report.held_out.levels.double()
     # Uniform, with four standard errors on the mean.
     assert ((levels.mean(dim=0) - 0.5).abs() < 4 / (12 * 150) ** 0.5).all()
     coverage = (levels < 0.9).double().mean(dim=0)

@@ -106,7 +106,7 @@ def test_an_entry_that_varies_only_in_reality_is_named_and_ignored() -> None:
 
 
 def test_a_gain_over_an_arbitrary_density_is_not_comparable() -> None:
-    far = Difference(mean=5e17, low=-1e18, high=2e18)
+    far = Estimate(mean=5e17, low=-1e18, high=2e18)
     assert compared(far, "NPE").startswith("not comparable with NPE as it was")
     assert is_comparable(replace(far, mean=1e3))
 

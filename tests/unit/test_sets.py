@@ -274,7 +274,7 @@ def test_the_bound_is_that_of_the_theorem() -> None:
 def test_scores_of_pairs_are_those_of_stacks_that_have_not_seen_them(
     stack: StackedPosterior,
 ) -> None:
-    known = stack.report.cross_validation
+    known = stack.report
     scores = known.set_scores
     assert scores is not None
     theta, x_cal = stacks.problem(20, seed=1)
@@ -308,7 +308,7 @@ def test_a_guaranteed_set_is_that_of_counting_the_held_out_scores(
     )
     at_theta = joint_scores(log_prob, rule.draws)
     assert rule.draws.shape == (5, 40)
-    known = stack.report.cross_validation
+    known = stack.report
     weights = fold_weights(known.log_scores, known.fold, None)
     near = (theta.abs() <= 1).all(dim=1)
     for number in range(5):
@@ -334,7 +334,7 @@ def test_guaranteed_intervals_of_a_batch_are_those_of_each_observation(
     found = stack.credible_intervals_batched(0.8, batch, guaranteed=True, seed=0)
     assert found.guarantee is not None
     rule: Any = stack.credible_set(0.8, x, guaranteed=True, seed=0).rule
-    marginal = stack.report.cross_validation.set_scores.marginal
+    marginal = stack.report.set_scores.marginal
     with seeded(0):
         draws = [
             one.sample_batched((40,), batch, **stacks.QUIET) for one in rule.posteriors
@@ -379,7 +379,7 @@ def test_labels_that_the_stack_says_are_impossible_are_refused(
     stack: StackedPosterior, x: Tensor
 ) -> None:
     changed = pickle.loads(pickle.dumps(stack))
-    known = stack.report.cross_validation
+    known = stack.report
     joint = known.set_scores.joint.clone()
 
     def make(count: int) -> CredibleSet:
@@ -399,7 +399,7 @@ def test_of_pairs_with_the_same_parameters_one_counts(x: Tensor) -> None:
     posterior = stacks.stacked(
         stacks.rope_of(pairs), candidates=[stacks.PRIOR, stacks.NPE]
     )
-    scores = posterior.report.cross_validation.set_scores
+    scores = posterior.report.set_scores
     assert scores is not None
     assert len(scores) == 12
     counted = pairs[0][scores.is_counted]

@@ -1,0 +1,161 @@
+"""The report of a stack as an HTML page, for readers who do not know this package."""
+
+import base64
+import io
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from importlib import import_module
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sbi_rope.diagnosis import Diagnosis
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.plots import (
+    discrepancy,
+    implied_parameters,
+    ranks_by_estimate,
+    stacking_report,
+)
+from sbi_rope.settings import check, names_of
+from sbi_rope.stacking import StackingReport
+from sbi_rope.stacking.sections import METHODS, headline, sections_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["write_html"]
+
+# A page of this package is recognised by this.
+GENERATOR = '<meta name="generator" content="sbi_rope'
+DPI = 130
+
+
+@dataclass
+class _Part:
+    """A section of the page: sentences, a table, and pictures with captions."""
+
+    title: str
+    lines: Sequence[tuple[str, bool]] = ()
+    heads: Sequence[str] = ()
+    rows: Sequence[Sequence[str]] = ()
+    pictures: Sequence[tuple[str, str]] = ()
+
+
+def write_html(
+    report: StackingReport,
+    path: str | PathLike[str],
+    *,
+    diagnosis: Diagnosis | None = None,
+    parameter_names: Sequence[str] | None = None,
+    x_names: Sequence[str] | None = None,
+) -> None:
+    """Write the report of a stack as one HTML file, see ``StackingReport.to_html``."""
+    check("report", report, StackingReport)
+    check("diagnosis", diagnosis, Diagnosis | None)
+    path = Path(path).expanduser()
+    if path.exists() and not (path.is_file() and GENERATOR in _start(path)):
+        raise InvalidInputError(
+            "Expected `path` to be a new file or an earlier report, which is replaced; "
+            f"got {path}."
+        )
+    names = report.held_out.names
+    if parameter_names is not None:
+        names = names_of(parameter_names, len(names))
+    if x_names is not None:
+        if report.discrepancy is None:
+            raise InvalidInputError(
+                "Expected no `x_names`, because this report does not compare the "
+                f"entries of x; got {list(x_names)}."
+            )
+        report = replace(report, discrepancy=report.discrepancy.renamed(x_names))
+    parts = list(_parts(report, names))
+    if diagnosis is not None:
+        parts.append(_of_diagnosis(diagnosis))
+    parts.append(_Part("How it was made", rows=list(report.provenance.items())))
+    from jinja2 import Environment, PackageLoader
+
+    environment = Environment(
+        loader=PackageLoader("sbi_rope", "report"),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    text = environment.get_template("page.html.j2").render(
+        title="Repaired posterior: report",
+        version=import_module("sbi_rope").__version__,
+        headline=headline(report),
+        sections=parts,
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+
+
+def _parts(report: StackingReport, names: Sequence[str]) -> Iterable[_Part]:
+    """Yield the sections of the printed report, with their tables and pictures."""
+    helped, trust, simulator, more = (
+        _Part(one.title, one.lines) for one in sections_of(report, names)
+    )
+    helped.heads = "candidate", "method", "weight", "nats a pair", "in prior units"
+    helped.rows = [
+        (
+            str(row["candidate"]),
+            METHODS.get(row["family"], str(row["family"])),
+            f"{row['weight']:.0%}",
+            f"{row['score']:.2f} ({row['score_low']:.2f} to {row['score_high']:.2f})",
+            f"{row['score_z']:.2f}",
+        )
+        for row in report.as_rows()
+    ]
+    caption = (
+        "Log densities of hold-out pairs with 95 % intervals, weights, and the share "
+        "of known parameters inside intervals of each level; the band holds 95 % of "
+        "the curves of calibrated posteriors."
+    )
+    helped.pictures = [(_encoded(stacking_report(report)), caption)]
+    yield helped
+    held_out = report.held_out
+    if any(held_out.dependence.found):
+        caption = (
+            "The rank of each known parameter among samples of its posterior, from 0 "
+            "(below all) to 1 (above all). Points are spread evenly if intervals are "
+            "right everywhere; those in grey bands are outside 90 % intervals."
+        )
+        figure = ranks_by_estimate(held_out, parameter_names=names)
+        trust.pictures = [(_encoded(figure), caption)]
+    yield trust
+    if (found := report.discrepancy) is not None:
+        simulator.heads = "entry", "size", "shift", "gain", "error", "no discrepancy"
+        simulator.rows = [
+            (
+                *(one.name, str(one.size), str(one.shift), str(one.gain)),
+                *(str(one.error), f"{one.probability_of_none:.0%}"),
+            )
+            for one in found.summaries
+        ]
+        caption = (
+            "measured = mean + shift + gain (simulated - mean) + error, for each entry "
+            "alone, with 95 % intervals. The size is in standard deviations of "
+            "simulations; the last column is the probability of no discrepancy."
+        )
+        simulator.pictures = [(_encoded(discrepancy(found)), caption)]
+    yield simulator
+    yield more
+
+
+def _of_diagnosis(diagnosis: Diagnosis) -> _Part:
+    lines = [(found.sentence, found.alarming) for found in diagnosis.findings]
+    picture = _encoded(implied_parameters(diagnosis))
+    caption = "The parameters that the batch implies, beside the prior."
+    return _Part("Diagnosis of the batch", lines, pictures=[(picture, caption)])
+
+
+def _encoded(figure: "Figure") -> str:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
+    return base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+def _start(path: Path) -> str:
+    with path.open("rb") as file:
+        return file.read(1000).decode("utf-8", errors="replace")
