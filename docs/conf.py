@@ -43,10 +43,8 @@ exclude_patterns = ["_build", "**/sbi-logs"]
 # need the network at every build.
 nitpicky = True
 OTHERS = r"(abc|collections|os|pathlib|sbi|torch)\..*|Figure|DirectPosterior"
-# What signatures name and users never make themselves.
-UNDOCUMENTED = "Found|StartingNPE|Term|Versions"
-ROOMS = "data|ensemble|labels|simulate|tasks"
-INSIDE = rf"sbi_rope\.(_.*|.*\.({UNDOCUMENTED})|({ROOMS})\..*)"
+# Modules inside of rooms, and rooms that are not on the pages.
+INSIDE = r"sbi_rope\.(_.*|[a-z_]+\.[a-z_]+\..*|(data|ensemble|labels|simulate)\..*)"
 nitpick_ignore_regex = [("py:.*", f"{OTHERS}|{INSIDE}")]
 
 myst_enable_extensions = ["dollarmath"]
