@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 SIZE = 50
-# The paper's letters; G is ours.
+# The paper's letters; from G on they are ours.
 LETTERS = {
     "cs": "A",
     "sir": "B",
@@ -41,6 +41,8 @@ LETTERS = {
     "light_tunnel": "E",
     "wind_tunnel": "F",
     "light_tunnel_sensors": "G",
+    "ocean_colour": "H",
+    "near_infrared": "I",
 }
 # "SBI" is no method, and other stacks are compared apart.
 NO_RIVALS = ("SBI", *STACKS)

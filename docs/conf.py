@@ -3,7 +3,6 @@
 import os
 import re
 import typing
-import warnings
 from pathlib import Path
 from unittest.mock import patch
 
@@ -44,13 +43,11 @@ exclude_patterns = ["_build", "**/sbi-logs"]
 # need the network at every build.
 nitpicky = True
 OTHERS = r"(abc|collections|os|pathlib|sbi|torch)\..*|Figure|DirectPosterior"
-# What signatures name and users never make themselves.
-UNDOCUMENTED = "Found|StartingNPE|Term|Versions"
-ROOMS = "data|ensemble|labels|simulate|tasks"
-INSIDE = rf"sbi_rope\.(_.*|.*\.({UNDOCUMENTED})|({ROOMS})\..*)"
+# Modules inside of rooms, and rooms that are not on the pages.
+INSIDE = r"sbi_rope\.(_.*|[a-z_]+\.[a-z_]+\..*|(data|ensemble|labels|simulate)\..*)"
 nitpick_ignore_regex = [("py:.*", f"{OTHERS}|{INSIDE}")]
 
-myst_enable_extensions = ["dollarmath", "colon_fence"]
+myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 
 nb_execution_mode = "cache"
@@ -59,13 +56,12 @@ nb_execution_raise_on_error = True
 # Warnings of other packages name folders of the machine that built the site.
 nb_output_stderr = "remove"
 
+autodoc_default_options = {"members": True}
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented_params"
-autodoc_typehints_format = "short"
 # What sbi documents is not said again.
 autodoc_inherit_docstrings = False
-napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 python_use_unqualified_type_names = True
 toc_object_entries_show_parents = "hide"
@@ -92,9 +88,6 @@ if REPOSITORY:
         "use_repository_button": True,
         "use_issues_button": True,
     }
-
-# sbi imports what warns of itself.
-warnings.filterwarnings("ignore", category=DeprecationWarning)
 
 
 def link_to_repository(app: Sphinx, docname: str, source: list[str]) -> None:
