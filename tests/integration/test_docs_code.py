@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -11,39 +12,30 @@ from sbi_rope import RoPE
 from tests import problems, stacks
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = sorted(
+START = [ROOT / "docs/index.md", ROOT / "docs/start/in_and_out.md"]
+PAGES = [
     page
-    for page in (
-        ROOT / "docs/index.md",
-        ROOT / "docs/start/in_and_out.md",
-        *ROOT.glob("docs/howto/*.md"),
-    )
+    for page in START + sorted(ROOT.glob("docs/howto/*.md"))
     if "```python" in page.read_text(encoding="utf-8")
-)
+]
 
 # As many readings as parameters, because a page simulates both in one shape.
 DIM = 3
 
 
-class TrainedNPE:
-    """Stands for the user's `npe`, which is trained once for all tests."""
-
-    def build_posterior(self) -> object:
-        return problems.npe_posterior("mdn", dim=DIM)
-
-
 @pytest.fixture(scope="module")
 def known() -> dict[str, Any]:
     """Return what `docs/howto/index.md` says that the names mean."""
-    npe, simulator = TrainedNPE(), problems.simulate
+    npe_posterior, simulator = problems.npe_posterior("mdn", dim=DIM), problems.simulate
     with torch.random.fork_rng():
         torch.manual_seed(0)
         theta = problems.box(DIM).sample((1000,))
         x = simulator(theta)
     theta_cal, x_cal = stacks.problem(10, seed=1, dim=DIM)
     theta_o, x_o = stacks.problem(30, seed=2, dim=DIM)
-    rope = RoPE(npe.build_posterior(), simulator=simulator)
+    rope = RoPE(npe_posterior, simulator=simulator)
     rope.append_calibration(theta_cal, x_cal)
+    npe = SimpleNamespace(build_posterior=lambda: npe_posterior)
     names = {"npe": npe, "simulator": simulator, "theta": theta, "x": x}
     names |= {"theta_cal": theta_cal, "x_cal": x_cal, "theta_o": theta_o, "x_o": x_o}
     return {**names, "rope": rope, "posterior": stacks.stacked(rope)}

@@ -8,20 +8,20 @@ import torch
 
 from tests.stacks import quick
 
-README = Path(__file__).resolve().parents[2] / "README.md"
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def example(page: str) -> str:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+    return code
 
 
 @pytest.mark.slow
 def test_the_example_stands_alone_and_repairs_a_posterior() -> None:
-    text = README.read_text(encoding="utf-8")
-    (code,) = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
     # With fewer simulations and epochs, for speed. `.ci/package` runs it as it is.
-    for usual, fewer in (
-        ("(2000,)", "(200,)"),
-        (".train()", ".train(max_num_epochs=20)"),
-    ):
-        assert usual in code
-        code = code.replace(usual, fewer)
+    code = example("README.md").replace("(2000,)", "(200,)")
+    code = code.replace(".train()", ".train(max_num_epochs=20)")
     names: dict[str, object] = {}
     with quick():
         exec(code, names)
@@ -31,6 +31,10 @@ def test_the_example_stands_alone_and_repairs_a_posterior() -> None:
     assert torch.isfinite(samples).all()
 
 
+def test_the_first_page_of_the_site_has_the_same_example() -> None:
+    assert example("docs/start/five_minutes.md") == example("README.md")
+
+
 def test_the_readme_is_short() -> None:
-    words = re.findall(r"\w\S*", README.read_text(encoding="utf-8"))
-    assert len(words) <= 1000
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(re.findall(r"\w\S*", text)) <= 1000
