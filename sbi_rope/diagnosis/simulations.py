@@ -7,20 +7,10 @@ import torch
 from torch import Tensor
 
 from sbi_rope._prior import divisors
-from sbi_rope.coupling import Coupling, SinkhornCoupler
+from sbi_rope.coupling import Coupling
 
-__all__ = [
-    "Implied",
-    "Simulations",
-    "couple_by_itself",
-    "implied_by",
-    "nearest_distances",
-    "resampled",
-]
+__all__ = ["Simulations", "implied_by", "nearest_distances", "resampled"]
 
-# At tau = 0 each observation is coupled by itself, without trust in the prior. The
-# smaller gamma is, the less the implied distribution is blurred.
-COUPLER = SinkhornCoupler(gamma=0.1, tau=0.0, cost_scale="simulated")
 # Points at which distribution functions are compared.
 NUM_POINTS = 100
 
@@ -42,9 +32,6 @@ class Simulations:
     theta: Tensor
     embedded: Tensor
     tuned: bool
-
-    def __len__(self) -> int:
-        return len(self.theta)
 
     @cached_property
     def noise(self) -> Tensor:
@@ -94,68 +81,42 @@ class Simulations:
 def nearest_distances(points: Tensor, among: Tensor, *, others: bool = False) -> Tensor:
     """Return the distance from each point to the nearest of others, shape ``(n,)``.
 
-    With ``others`` the two sets are the same, and no point is its own neighbour.
+    With ``others`` a point is compared with all but the one in its own row.
     """
     nearest = []
-    for first in range(0, len(points), CHUNK):
-        distance = torch.cdist(points[first : first + CHUNK], among)
+    for rows in torch.arange(len(points)).split(CHUNK):
+        distance = torch.cdist(points[rows], among)
         if others:
-            own = torch.arange(len(distance))
-            distance[own, first + own] = torch.inf
+            distance.scatter_(1, rows[:, None], torch.inf)
         nearest.append(distance.amin(dim=1))
     return torch.cat(nearest)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Implied:
-    """The parameters that the observations of a set imply.
-
-    Attributes:
-        weights: Mean weights of the simulations, which sum to one, ``(n_s,)``.
-        functions: The distribution functions of each observation, at points of each
-            parameter, ``(n, d, points)``.
-    """
-
-    weights: Tensor
-    functions: Tensor
-
-
-def couple_by_itself(simulations: Simulations) -> Coupling:
-    """Return a coupling whose rows depend on one observation only."""
-    # At tau = 0 the potential is zero for any batch, so that a few rows are enough.
-    return COUPLER.couple(simulations.embedded[:100], simulations.embedded)
-
-
 def implied_by(
-    coupling: Coupling,
-    real: Tensor,
-    simulations: Simulations,
-    *,
-    own: Tensor | None = None,
-) -> Implied:
-    r"""Return the parameters that embeddings imply.
+    coupling: Coupling, points: Tensor, theta: Tensor, *, others: bool = False
+) -> tuple[Tensor, Tensor]:
+    r"""Return the parameters that embeddings ``(n, l)`` imply.
 
-    Observation i gives simulation j the weight
-    :math:`\operatorname{softmax}_j(-C_{ij} / \gamma)`. For simulations that take the
-    place of observations, ``own`` are their numbers, and none is matched with itself.
+    Point i gives simulation j the weight :math:`\operatorname{softmax}_j(-C_{ij} /
+    \gamma)`. With ``others`` it is not matched with the simulation in its own row.
+
+    Returns:
+        The mean weights of the simulations, ``(n_s,)``, which sum to one; and the
+        distribution functions of each point, ``(n, d, NUM_POINTS)``.
     """
-    theta = simulations.theta
     order, last = theta.argsort(dim=0), len(theta) - 1
     # The ranks at which distribution functions are compared.
     where = torch.linspace(0, last, min(NUM_POINTS, len(theta))).round().long()
-    total = torch.zeros(len(theta), dtype=torch.float64)
-    functions = []
-    for first in range(0, len(real), CHUNK):
-        block = slice(first, first + CHUNK)
-        weights = coupling.rows(real[block])
-        if own is not None:
-            rows = torch.arange(len(weights))
-            weights[rows, own[block]] = 0.0
-            weights = weights / weights.sum(dim=1, keepdim=True).clamp_min(1e-300)
+    total, functions = torch.zeros(len(theta), dtype=torch.float64), []
+    for rows in torch.arange(len(points)).split(CHUNK):
+        weights = coupling.rows(points[rows])
+        if others:
+            weights = weights.scatter(1, rows[:, None], 0.0)
+            weights /= weights.sum(dim=1, keepdim=True).clamp_min(1e-300)
         total += weights.sum(dim=0)
         each = [weights[:, column].cumsum(dim=1)[:, where] for column in order.T]
         functions.append(torch.stack(each, dim=1))
-    return Implied(weights=total / len(real), functions=torch.cat(functions))
+    return total / len(points), torch.cat(functions)
 
 
 def resampled(values: Tensor, size: int, *, num_draws: int) -> Tensor:
