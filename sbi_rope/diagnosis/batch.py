@@ -14,15 +14,17 @@ from sbi_rope.density import MixturePosterior
 from sbi_rope.diagnosis.misspecification import (
     after_tuning,
     before_tuning,
+    distances,
+    effective_sizes,
     far_entries,
     mmd_test,
     unlike_pairs,
+    unmatched,
 )
 from sbi_rope.diagnosis.prior_shift import prior_shift, shifts
 from sbi_rope.diagnosis.report import Diagnosis, Finding
 from sbi_rope.diagnosis.residuals import cross_fit, residual_finding
 from sbi_rope.diagnosis.simulations import Simulations
-from sbi_rope.diagnosis.support import effective_sizes, support_of, unmatched
 from sbi_rope.discrepancy.parameters import is_improbable
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.rope import RoPE
@@ -33,13 +35,10 @@ __all__ = ["diagnose"]
 
 # With fewer simulations the thresholds cannot be estimated.
 FEWEST_SIMULATIONS = 100
-Folds = Annotated[int, Range(2)]
 # So many draws of the prior make a smooth histogram.
 NUM_DRAWN = 20_000
-NO_POSTERIOR = Finding(
-    name="posterior",
-    sentence="None was given. Pass `posterior=` to count only the alarms about the one "
-    "that you use: a stack has no couplings and no tuned embedding net.",
+NO_POSTERIOR = (
+    "Not known. If you use a stack, pass `posterior=` to leave out what is about RoPE."
 )
 
 
@@ -57,26 +56,20 @@ def diagnose(
     r"""Test whether a batch fulfils the assumptions of RoPE and of a stack.
 
     1. Is the batch like the observations of the calibration pairs? This is an energy
-       test of :math:`h(x_o)`, and of NPE's estimate of each parameter, against those of
-       the pairs. What was found on the pairs holds for observations like theirs.
-    2. Is an entry of x many standard deviations away from simulations? This is tested
-       if NPE standardises x.
-    3. Do the parameters of the batch follow the prior? The parameters of the
-       simulations, weighted by the coupling at tau = 0, are compared with the prior.
-    4. Does NPE see the batch as unlike simulations? This is sbi's MMD test of
-       :math:`h(x_o)` against :math:`h(x_s)`.
-
-    The others are about RoPE only:
-
-    5. Does the batch still differ after tuning? This is the test of :math:`g(x_o)`.
+       test of :math:`h(x_o)`, and of NPE's estimate of each parameter.
+    2. Is an entry of x many standard deviations away from simulations?
+    3. Do the parameters of the batch follow the prior? Those of the simulations,
+       weighted by the coupling at tau = 0, are compared with it.
+    4. Does :math:`h(x_o)` differ from :math:`h(x_s)`? This is sbi's MMD test.
+    5. Does :math:`g(x_o)` still differ from it, after tuning?
     6. Which observations have no simulation near them?
     7. How many simulations are behind each posterior?
     8. Do the residuals :math:`g(x) - E[h(S(\theta))]` of calibration pairs depend on
        :math:`\theta`? They are computed on pairs that g was not trained on.
 
-    Without calibration pairs g is h, and 1, 5 and 8 are left out. One batch in a
-    hundred that fulfils the assumptions exceeds the threshold of 1, and so it is of 3,
-    of 4, of 5 and of 6. The thresholds of 7 are rules of thumb about gamma.
+    The last four are about RoPE only. Without calibration pairs g is h, and 1, 5 and 8
+    are left out. Of batches that fulfil the assumption, one in a hundred is an alarm of
+    1, and so for 3, 4, 5 and 6. The thresholds of 7 are rules of thumb about gamma.
 
     Args:
         rope: A RoPE, which is not changed. If calibration pairs were appended but not
@@ -86,18 +79,16 @@ def diagnose(
             simulations if there are fewer.
         num_folds: The number of trainings for 8, each of which takes as long as
             ``rope.train``. None leaves out 8, and the allowance for errors of g in 3.
-        posterior: The posterior that you use, made with the same pairs. For one of
-            :func:`sbi_rope.stack` the tests 5 to 8 are left out. A shift of 3 is then
-            no alarm if the stack has learned from the pairs how parameters are
-            distributed, and 1 shows no sign of a difference.
+        posterior: The posterior that you use, made with the same pairs. For a stack 5
+            to 8 are left out. A shift of 3 is then no alarm if the stack has learned it
+            from the pairs, and 1 shows no sign of a difference.
         parameter_names: One name for each parameter. If None, those of ``rope``, or
             "theta_1" and so on.
         seed: Seed of everything random; None uses the states of torch, NumPy and
             Python. The simulations are those of ``rope.build_posterior`` with the same
             seed and number.
-        show_progress_bars: Whether to show the progress of slow simulations, and how
-            many folds are done. None does so in a terminal or a notebook, but not in a
-            file.
+        show_progress_bars: Whether to show the progress of slow simulations and of the
+            folds. None does so in a terminal or a notebook.
 
     Returns:
         The findings. Print them, or pass them to
@@ -108,14 +99,13 @@ def diagnose(
     """
     check("rope", rope, RoPE)
     check("posterior", posterior, MixturePosterior | None)
-    check("num_folds", num_folds, Folds | None)
+    check("num_folds", num_folds, Annotated[int, Range(2)] | None)
     pairs, tuned = rope.pairs, len(rope.pairs) > 0
     if tuned and not rope.is_trained:
         rope = copy.copy(rope)  # which shares all data
         rope.train(seed=seed, show_progress_bars=show_progress_bars)
     with seeded(seed):
-        # This comes first, so that a posterior with the same seed has these
-        # simulations.
+        # First, so that a posterior with the same seed has these simulations.
         batch = rope.embed(
             x_o, num_simulations=num_simulations, show_progress_bars=show_progress_bars
         )
@@ -133,45 +123,38 @@ def diagnose(
             theta=_moved(batch.theta), embedded=_moved(batch.simulated), tuned=tuned
         )
         simulated, embedded = simulations.embedded, npe.embed("x_o", batch.x_o, npe.h)
-        like_pairs = None
+        before = mmd_test(_moved(embedded), simulated, null=simulated)
+        like_pairs = after = held_out = None
         if tuned:
-            of_pairs = npe.embed("x", pairs.x, npe.h)
-            like_pairs = compare_with_pairs(
-                of_pairs, pairs.group.cpu(), embedded, npe.density()
-            )
-        before, after = mmd_test(_moved(embedded), simulated, null=simulated), None
-        if tuned:
+            of_pairs, groups = npe.embed("x", pairs.x, npe.h), pairs.group.cpu()
+            like_pairs = compare_with_pairs(of_pairs, groups, embedded, npe.density())
             after = mmd_test(real, simulated, null=simulations.averaged)
-        support, coupling = support_of(real, simulations), batch.couple(rope.coupler)
-        held_out = None
+        distance, coupling = distances(real, simulations), batch.couple(rope.coupler)
         if num_folds is not None and pairs.num_groups > 1:
-            held_out = cross_fit(
-                rope,
-                num_folds=num_folds,
-                show_progress_bars=is_shown(show_progress_bars),
-            )
+            show = is_shown(show_progress_bars)
+            held_out = cross_fit(rope, num_folds=num_folds, show_progress_bars=show)
         shift = prior_shift(real, simulations, held_out)
+        learned = _learned(posterior, like_pairs, names)
         findings = [
             unlike_pairs(like_pairs, names),
             far_entries(npe.h, batch.x_o),
-            *shifts(shift, simulations, names, _learned(posterior, like_pairs, names)),
+            *shifts(shift, simulations, names, learned),
             before_tuning(before, tuned=tuned),
         ]
         of_rope = [
             after_tuning(after, before),
-            unmatched(support),
+            unmatched(distance, len(simulated)),
             effective_sizes(coupling, len(simulated)),
             residual_finding(pairs, held_out, simulations),
         ]
         prior = _moved(npe.prior.sample(torch.Size((NUM_DRAWN,))))
     if not isinstance(posterior, StackedPosterior):
         findings += of_rope
-    if posterior is None:
-        findings.append(NO_POSTERIOR)
+    if tuned and posterior is None:
+        findings.append(Finding("posterior in use", NO_POSTERIOR))
     return Diagnosis(
         findings=tuple(findings),
-        flags=support.flags,
-        distance=support.distance,
+        distance=distance,
         theta=simulations.theta,
         implied=shift.implied,
         unshifted=shift.unshifted,
@@ -185,20 +168,13 @@ def _learned(
     like_pairs: TwoSampleTest | None,
     names: Sequence[str],
 ) -> tuple[str, ...]:
-    """Return the parameters whose shift a stack has learned from pairs like the batch.
-
-    With pairs that are unlike the batch it has learned another one.
-    """
-    if (
-        not isinstance(posterior, StackedPosterior)
-        or like_pairs is None
-        or like_pairs.is_different
-    ):
+    """Return the parameters whose shift a stack has learned from pairs like these."""
+    if like_pairs is None or like_pairs.is_different:
         return ()
-    report = posterior.report
-    if not report.learns_prior or not is_improbable(report.probability_of_prior):
+    if not isinstance(posterior, StackedPosterior) or not posterior.report.learns_prior:
         return ()
-    return like_pairs.alike(names)
+    is_learned = is_improbable(posterior.report.probability_of_prior)
+    return like_pairs.alike(names) if is_learned else ()
 
 
 def _moved(values: Tensor) -> Tensor:

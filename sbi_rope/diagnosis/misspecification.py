@@ -1,22 +1,45 @@
-"""Test whether a batch is unlike simulations, or unlike the calibration pairs."""
+"""Test whether a batch is like simulations and pairs, and has simulations near it."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
+from scipy.stats import binom
 from torch import Tensor, nn
 
 from sbi_rope._sbi import squared_mmd
 from sbi_rope._standardisation import FAR, deviations
 from sbi_rope._statistics import LEVEL, TwoSampleTest
+from sbi_rope.coupling import Coupling
 from sbi_rope.diagnosis.report import UNLIKE_PAIRS, Finding
+from sbi_rope.diagnosis.simulations import Simulations, nearest_distances
 
-__all__ = ["after_tuning", "before_tuning", "far_entries", "mmd_test", "unlike_pairs"]
+__all__ = [
+    "after_tuning",
+    "before_tuning",
+    "distances",
+    "effective_sizes",
+    "far_entries",
+    "mmd_test",
+    "unlike_pairs",
+    "unmatched",
+]
 
 # The largest numbers of observations and simulations in one MMD, whose cost is
 # quadratic.
 MAX_OBSERVATIONS, MAX_SIMULATIONS = 200, 400
 NUM_DRAWS = 200
+# An observation is flagged if its nearest simulation is farther away than the nearest
+# neighbours of all simulations but this share.
+FLAGGED_SHARE = 0.001
+# Among many observations some are flagged by chance, but hardly one is this many times
+# as far away as the limit.
+FAR_AWAY = 2.0
+# With ten simulations the centre of a posterior is off by a third of their spread,
+# which should be an exception.
+FEW, MANY_WITH_FEW = 10.0, 0.05
+# A posterior over half of all simulations is almost the prior.
+INDISTINCT = 0.5
 
 
 class MMDTest(NamedTuple):
@@ -132,3 +155,76 @@ def far_entries(embedding_net: nn.Module, x_o: Tensor) -> Finding:
     if value > FAR:
         sentence += " Check its unit: the answer of NPE is arbitrary there."
     return Finding(name, sentence, value > FAR, value, FAR)
+
+
+def distances(real: Tensor, simulations: Simulations) -> Tensor:
+    """Return how far ``real`` is from the nearest simulation, where 1 is the limit.
+
+    The distance of a simulation to itself is left out, so that a simulation that takes
+    the place of an observation exceeds the limit with :func:`chance_of_flag`. A tuned g
+    averages over the simulator's noise, and may put observations between simulations,
+    such as between the categories of an entry. The limit allows for that.
+    """
+    embedded, averaged = simulations.embedded, simulations.averaged
+    # A new value exceeds the (k+1)-th largest of n with probability (k + 1) / (n + 1).
+    k = int(FLAGGED_SHARE * len(embedded))
+    limit = max(
+        float(nearest_distances(ends, embedded, others=True).sort().values[-1 - k])
+        for ends in (embedded, averaged)
+    )
+    smallest = torch.finfo(torch.float64).tiny
+    return nearest_distances(real, embedded) / max(limit, smallest)
+
+
+def chance_of_flag(num_simulations: int) -> float:
+    """Return the probability that a simulation is farther away than the limit."""
+    return (int(FLAGGED_SHARE * num_simulations) + 1) / (num_simulations + 1)
+
+
+def unmatched(distance: Tensor, num_simulations: int) -> Finding:
+    """Say how many observations have no simulation near them.
+
+    One batch of simulations in a hundred has more flags than the threshold. A single
+    observation that is very far away is an alarm by itself.
+    """
+    count, flags = len(distance), (distance > 1).nonzero().flatten().tolist()
+    allowed = float(binom.ppf(0.99, count, chance_of_flag(num_simulations)))
+    value, threshold, farthest = float(len(flags)), allowed, float(distance.max())
+    sentence = (
+        f"{len(flags)} of {count} observations have no simulation near them (by chance "
+        f"up to {allowed:.0f}), and observation {int(distance.argmax())} is the "
+        f"farthest, at {farthest:.2g} times the limit."
+    )
+    if value <= threshold and farthest > FAR_AWAY:
+        value, threshold = farthest, FAR_AWAY
+    if alarming := value > threshold:
+        shown = ", ".join(map(str, flags[:10])) + (", ..." if flags[10:] else "")
+        sentence += f" Look at {shown} before you trust RoPE's posteriors there."
+    name = "observations no simulation matches"
+    return Finding(name, sentence, alarming, value, threshold)
+
+
+def effective_sizes(coupling: Coupling, num_simulations: int) -> Finding:
+    """Say whether posteriors of RoPE use very few simulations, or almost all."""
+    sizes = coupling.effective_sample_size.cpu().double()
+    share, median = float((sizes < FEW).double().mean()), float(sizes.median())
+    sentence = (
+        f"A typical posterior of RoPE uses {median:.3g} of {num_simulations} "
+        f"simulations, and {share:.0%} use fewer than {FEW:.0f}."
+    )
+    value, threshold = share, MANY_WITH_FEW
+    if share > MANY_WITH_FEW:
+        sentence += " Raise `num_simulations` or gamma."
+    elif median > INDISTINCT * num_simulations:
+        value, threshold = median / num_simulations, INDISTINCT
+        sentence += " This is almost the prior. " + (
+            "A smaller gamma separates the observations."
+            if len(sizes) > 1
+            # The sums of the columns are given, and a single row has to have them.
+            else "At tau=1 a single observation has the prior for any gamma. Couple it "
+            "with others, or use `stack(rope)`, which needs no batch."
+        )
+    if not coupling.converged:
+        sentence += " The coupling has not converged, so that this is approximate."
+    name, alarming = "simulations behind each posterior", value > threshold
+    return Finding(name, sentence, alarming, value, threshold)

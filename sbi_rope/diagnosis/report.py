@@ -44,9 +44,8 @@ class Diagnosis:
 
     Attributes:
         findings: What the tests found that concern the posterior in use.
-        flags: Indices of the observations that no simulation matches, int64.
         distance: Distance from :math:`g(x_o)` to the nearest simulation, ``(n_o,)``, in
-            units of the median distance from a simulation to its nearest neighbour.
+            units of the limit above which an observation is flagged.
         theta: The parameters of the simulations, ``(n_s, d)``.
         implied: Weights of ``theta`` that estimate the distribution of the parameters
             of the batch, ``(n_s,)``. They sum to one.
@@ -57,13 +56,17 @@ class Diagnosis:
     """
 
     findings: tuple[Finding, ...]
-    flags: Tensor
     distance: Tensor = field(repr=False)
     theta: Tensor = field(repr=False)
     implied: Tensor = field(repr=False)
     unshifted: Tensor = field(repr=False)
     prior: Tensor = field(repr=False)
     parameter_names: tuple[str, ...]
+
+    @property
+    def flags(self) -> Tensor:
+        """Indices of the observations that no simulation matches, int64."""
+        return (self.distance > 1).nonzero().flatten()
 
     @property
     def alarming(self) -> tuple[Finding, ...]:

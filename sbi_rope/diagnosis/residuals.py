@@ -48,32 +48,17 @@ class HeldOut(NamedTuple):
         return torch.tensordot(member / member.sum(dim=1, keepdim=True), values, dims=1)
 
 
-class Dependence(NamedTuple):
-    """The p-value of a permutation test, and a bias with its standard error.
-
-    The bias is the root mean square of the part of residuals that depends on theta.
-    """
-
-    p_value: float
-    bias: float
-    error: float
-
-
 def num_features(num_pairs: int, dim: int) -> int:
     """Return how many features of the parameters to regress on; 0 if pairs are few."""
-    for count in (2 * dim, dim):
-        if num_pairs >= 2 * (count + 1) + 2:
-            return count
-    return 0
+    return next((p for p in (2 * dim, dim) if num_pairs >= 2 * (p + 1) + 2), 0)
 
 
 def cross_fit(rope: RoPE, *, num_folds: int, show_progress_bars: bool) -> HeldOut:
     r"""Embed each calibration pair by a g that was trained on the other folds.
 
-    The residuals of pairs that g was trained on would be too small. There is one
-    training for each fold. Where labels are not exact, g is tuned to averages given the
-    label alone, other than by :meth:`RoPE.train`, because residuals from averages that
-    are also given x would be too small.
+    Where labels are not exact, g is tuned to averages given the label alone, other than
+    by :meth:`RoPE.train`: residuals from averages that are also given x would be too
+    small, as they would be of pairs that g was trained on.
     """
     pairs, h = rope.pairs, rope.embedding_net
     targets = rope.draw_targets(
@@ -102,16 +87,17 @@ def cross_fit(rope: RoPE, *, num_folds: int, show_progress_bars: bool) -> HeldOu
     )
 
 
-def dependence(residuals: Tensor, theta: Tensor) -> Dependence:
-    r"""Regress residuals on parameters and their squares, with a permutation test.
+def dependence(residuals: Tensor, theta: Tensor) -> tuple[float, float, float]:
+    r"""Regress residuals ``(n, l)`` on parameters ``(n, d)`` and their squares.
 
-    The statistic is the sum of squares that the regression explains. With p features
-    and residual variance :math:`s^2`, the bias b is estimated by
-    :math:`b^2 = (\text{explained} - p\, s^2) / n`, which is unbiased. If pairs are few,
-    the squares of the parameters are left out. The standard error of b is at most about
-    :math:`\sqrt{(s^2 + b^2 / 2) / n}`, its value if all residual variance has the
-    direction of the bias.
-    Shapes are ``(n, l)`` and ``(n, d)``.
+    With p features that explain a sum of squares, and residual variance :math:`s^2`,
+    the bias b is estimated by :math:`b^2 = (\text{explained} - p\, s^2) / n`, which is
+    unbiased. If pairs are few, the squares of the parameters are left out. The standard
+    error of b is at most about :math:`\sqrt{(s^2 + b^2 / 2) / n}`, its value if all
+    residual variance has the direction of the bias.
+
+    Returns:
+        The p-value of a permutation test, b, and its standard error.
     """
     count = num_features(*theta.shape)
     standard = (theta - theta.mean(dim=0)) / divisors(theta.std(dim=0))
@@ -121,11 +107,7 @@ def dependence(residuals: Tensor, theta: Tensor) -> Dependence:
     total = float((residuals - residuals.mean(dim=0)).square().sum())
     variance = (total - found.explained) / (n - 1 - p)
     square = max(found.explained - p * variance, 0.0) / n
-    return Dependence(
-        p_value=found.p_value,
-        bias=square**0.5,
-        error=((variance + square / 2) / n) ** 0.5,
-    )
+    return found.p_value, square**0.5, ((variance + square / 2) / n) ** 0.5
 
 
 def residual_finding(
@@ -162,18 +144,16 @@ def bias_finding(residuals: Tensor, theta: Tensor, simulations: Simulations) -> 
     simulations has the variance :math:`R (1 - R)`. The ratio is
     :math:`\sqrt{R (1 - R)} \le 1/2`.
     """
-    found = dependence(residuals, theta)
+    p_value, bias, error = dependence(residuals, theta)
     spread = float(simulations.embedded.var(dim=0).sum())
     noise = float(simulations.noise.trace())
-    unit = max(noise, SMALLEST_SHARE**2 * spread) ** 0.5
-    lower = max(found.bias - 1.645 * found.error, 0.0)
-    value = lower / unit if unit else float(lower > 0)
-    alarming = found.p_value < LEVEL and value > LARGEST_RATIO
-    bias = found.bias / unit if unit else 0.0
+    unit = max(noise, SMALLEST_SHARE**2 * spread) ** 0.5 or 1.0
+    value = max(bias - 1.645 * error, 0.0) / unit
+    alarming = p_value < LEVEL and value > LARGEST_RATIO
     sentence = (
-        f"The bias of residuals that depends on the parameters is {bias:.2g} times the "
-        f"simulator's noise (p = {found.p_value:.2g}); averaging over noise gives up "
-        f"to {LARGEST_RATIO}."
+        f"The bias that depends on the parameters is {bias / unit:.2g} times the "
+        f"simulator's noise (p = {p_value:.2g}); averaging over noise gives up to "
+        f"{LARGEST_RATIO}."
     )
     if alarming:
         sentence += (

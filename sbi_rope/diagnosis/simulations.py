@@ -37,10 +37,9 @@ class Simulations:
     def noise(self) -> Tensor:
         r"""Covariance :math:`W` of :math:`h(x_s)` given theta, ``(l, l)``.
 
-        It is estimated from the differences between simulations with neighbouring
-        parameters, after a quadratic trend is subtracted. No further simulations are
-        needed. With many parameters and few simulations, neighbours are far apart and
-        the estimate is too large.
+        It is estimated from differences between simulations with neighbouring
+        parameters, without a quadratic trend. With many parameters and few simulations,
+        neighbours are far apart and the estimate is too large.
         """
         theta, embedded = self.theta[:MAX_FOR_NOISE], self.embedded[:MAX_FOR_NOISE]
         standard = (theta - theta.mean(dim=0)) / divisors(theta.std(dim=0))
@@ -60,10 +59,8 @@ class Simulations:
         r"""Move embeddings ``(n, l)`` as tuning does if nothing is wrong.
 
         Tuning moves :math:`g(x)` towards :math:`E[h \mid \theta]`. It can reach at best
-        the mean of this given x, which averages out the noise of single simulations
-        and is drawn to the centre. To first order it is
-        :math:`\mu + (I - W V^{-1})(h - \mu)`, with V the covariance of h. Without
-        tuning, h is not changed.
+        the mean of this given x, to first order :math:`\mu + (I - W V^{-1})(h - \mu)`,
+        with V the covariance of h. Without tuning, h is not changed.
         """
         if not self.tuned:
             return points
