@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
-from sbi_rope._statistics import TwoSampleTest, compare_with_pairs
+from sbi_rope._statistics import compare_with_pairs
 from sbi_rope.density import MixturePosterior
 from sbi_rope.diagnosis.misspecification import (
     after_tuning,
@@ -35,11 +35,7 @@ __all__ = ["diagnose"]
 
 # With fewer simulations the thresholds cannot be estimated.
 FEWEST_SIMULATIONS = 100
-# So many draws of the prior make a smooth histogram.
-NUM_DRAWN = 20_000
-NO_POSTERIOR = (
-    "Not known. If you use a stack, pass `posterior=` to leave out what is about RoPE."
-)
+Folds = Annotated[int, Range(2)]
 
 
 def diagnose(
@@ -99,7 +95,7 @@ def diagnose(
     """
     check("rope", rope, RoPE)
     check("posterior", posterior, MixturePosterior | None)
-    check("num_folds", num_folds, Annotated[int, Range(2)] | None)
+    check("num_folds", num_folds, Folds | None)
     pairs, tuned = rope.pairs, len(rope.pairs) > 0
     if tuned and not rope.is_trained:
         rope = copy.copy(rope)  # which shares all data
@@ -118,40 +114,41 @@ def diagnose(
         names = rope.parameter_names or default_names(dim)
         if parameter_names is not None:
             names = names_of(parameter_names, dim)
-        npe, real = batch.npe, _moved(batch.real)
-        simulations = Simulations(
-            theta=_moved(batch.theta), embedded=_moved(batch.simulated), tuned=tuned
-        )
-        simulated, embedded = simulations.embedded, npe.embed("x_o", batch.x_o, npe.h)
+        npe, real, simulated = batch.npe, _moved(batch.real), _moved(batch.simulated)
+        simulations = Simulations(_moved(batch.theta), simulated, tuned)
+        embedded = npe.embed("x_o", batch.x_o, npe.h)
         before = mmd_test(_moved(embedded), simulated, null=simulated)
         like_pairs = after = held_out = None
         if tuned:
             of_pairs, groups = npe.embed("x", pairs.x, npe.h), pairs.group.cpu()
             like_pairs = compare_with_pairs(of_pairs, groups, embedded, npe.density())
             after = mmd_test(real, simulated, null=simulations.averaged)
-        distance, coupling = distances(real, simulations), batch.couple(rope.coupler)
+        distance = distances(real, simulations)
         if num_folds is not None and pairs.num_groups > 1:
             show = is_shown(show_progress_bars)
             held_out = cross_fit(rope, num_folds=num_folds, show_progress_bars=show)
         shift = prior_shift(real, simulations, held_out)
-        learned = _learned(posterior, like_pairs, names)
+        learned: tuple[str, ...] = ()
+        if like_pairs and not like_pairs.is_different and _has_learned(posterior):
+            learned = like_pairs.alike(names)
         findings = [
             unlike_pairs(like_pairs, names),
             far_entries(npe.h, batch.x_o),
             *shifts(shift, simulations, names, learned),
             before_tuning(before, tuned=tuned),
         ]
-        of_rope = [
-            after_tuning(after, before),
-            unmatched(distance, len(simulated)),
-            effective_sizes(coupling, len(simulated)),
-            residual_finding(pairs, held_out, simulations),
-        ]
-        prior = _moved(npe.prior.sample(torch.Size((NUM_DRAWN,))))
-    if not isinstance(posterior, StackedPosterior):
-        findings += of_rope
+        if not isinstance(posterior, StackedPosterior):
+            findings += [
+                after_tuning(after, before),
+                unmatched(distance, len(simulated)),
+                effective_sizes(batch.couple(rope.coupler), len(simulated)),
+                residual_finding(pairs, held_out, simulations),
+            ]
+        # So many that a histogram is smooth.
+        prior = _moved(npe.prior.sample(torch.Size((20_000,))))
     if tuned and posterior is None:
-        findings.append(Finding("posterior in use", NO_POSTERIOR))
+        sentence = "Not known. Pass `posterior=` to count only the alarms about it."
+        findings.append(Finding("posterior in use", sentence))
     return Diagnosis(
         findings=tuple(findings),
         distance=distance,
@@ -163,18 +160,12 @@ def diagnose(
     )
 
 
-def _learned(
-    posterior: MixturePosterior | None,
-    like_pairs: TwoSampleTest | None,
-    names: Sequence[str],
-) -> tuple[str, ...]:
-    """Return the parameters whose shift a stack has learned from pairs like these."""
-    if like_pairs is None or like_pairs.is_different:
-        return ()
-    if not isinstance(posterior, StackedPosterior) or not posterior.report.learns_prior:
-        return ()
-    is_learned = is_improbable(posterior.report.probability_of_prior)
-    return like_pairs.alike(names) if is_learned else ()
+def _has_learned(posterior: MixturePosterior | None) -> bool:
+    """Tell whether it is a stack that learned other parameters than the prior's."""
+    if not isinstance(posterior, StackedPosterior):
+        return False
+    report = posterior.report
+    return report.learns_prior and is_improbable(report.probability_of_prior)
 
 
 def _moved(values: Tensor) -> Tensor:

@@ -78,8 +78,8 @@ def mmd_test(batch: Tensor, simulated: Tensor, *, null: Tensor) -> MMDTest:
         order = torch.randperm(len(simulated))[: num_real + num_simulated]
         real, other = order[:num_real], order[num_real:]
         usual[i] = squared_mmd(null[real], simulated[other])
-    others = simulated[torch.randperm(len(simulated))[:num_simulated]]
-    value = squared_mmd(chosen, others)
+    other = torch.randperm(len(simulated))[:num_simulated]
+    value = squared_mmd(chosen, simulated[other])
     # The batch itself counts as one of the draws, so that p is never 0.
     p_value = (1 + int((usual >= value).sum())) / (1 + NUM_DRAWS)
     return MMDTest(value, float(usual.median()), p_value)
@@ -88,7 +88,7 @@ def mmd_test(batch: Tensor, simulated: Tensor, *, null: Tensor) -> MMDTest:
 def before_tuning(test: MMDTest, *, tuned: bool) -> Finding:
     """Say whether h(x_o) is unlike h(x_s), which pairs can repair."""
     is_unlike = test.p_value < LEVEL
-    sentence = f"No sign that NPE sees the batch so (p = {test.p_value:.2g})."
+    sentence = f"No sign of it (p = {test.p_value:.2g})."
     if is_unlike:
         sentence = f"NPE sees the batch as unlike simulations: {test}. " + (
             "This is what the calibration pairs repair, and no alarm."
@@ -110,9 +110,9 @@ def after_tuning(test: MMDTest | None, before: MMDTest) -> Finding:
     sentence = f"No sign of it (p = {test.p_value:.2g}; the squared MMD is {course})."
     if is_unlike:
         sentence = (
-            f"RoPE's tuned embedding net sees the batch as unlike simulations: {test}, "
-            f"{course}. Append more calibration pairs like the batch. If the batch is "
-            "narrower than the prior or shifted, that may be the reason."
+            f"RoPE's tuned embedding net sees the batch as unlike simulations: {test}. "
+            f"It is {course}. Append more calibration pairs like the batch, or lower "
+            "tau if the batch is narrower than the prior or shifted."
         )
     return Finding(name, sentence, is_unlike, test.p_value, LEVEL)
 
@@ -120,21 +120,17 @@ def after_tuning(test: MMDTest | None, before: MMDTest) -> Finding:
 def unlike_pairs(test: TwoSampleTest | None, names: Sequence[str]) -> Finding:
     """Say whether what was found on the pairs holds for the batch."""
     if test is None:
-        return Finding(
-            UNLIKE_PAIRS,
-            "Not tested, because this needs at least five observations and five "
-            "calibration pairs with different parameters (or groups).",
-        )
-    size = f"its observations are {test.spread:.2f} times as far apart as theirs"
-    sentence = f"No sign of it (p = {test.p_value:.2g}): {size}."
+        few = "five observations and five pairs with different labels (or groups)"
+        return Finding(UNLIKE_PAIRS, f"Not tested, because this needs {few}.")
+    sentence = f"No sign of it (p = {test.p_value:.2g})."
     if test.is_different:
-        found = test.parameters(names)
-        where = f", and its parameters differ in {', '.join(found)}" if found else ""
+        found = ", ".join(test.parameters(names))
+        where = f", and its parameters differ in {found}" if found else ""
         sentence = (
-            "NPE sees the batch as unlike the observations of the pairs (p = "
-            f"{test.p_value:.2g}): {size}{where}. Label some observations like those "
-            "of the batch. The weights, scores and calibration of a stack, and "
-            "guarantees of sets, were found on the pairs and need not hold here."
+            f"NPE sees the batch as unlike the pairs (p = {test.p_value:.2g}): its "
+            f"observations are {test.spread:.2f} times as far apart{where}. Label some "
+            "observations like those of the batch. Weights, scores, calibration and "
+            "guarantees that were found on the pairs need not hold here."
         )
     return Finding(UNLIKE_PAIRS, sentence, test.is_different, test.p_value, LEVEL)
 
@@ -160,10 +156,10 @@ def far_entries(embedding_net: nn.Module, x_o: Tensor) -> Finding:
 def distances(real: Tensor, simulations: Simulations) -> Tensor:
     """Return how far ``real`` is from the nearest simulation, where 1 is the limit.
 
-    The distance of a simulation to itself is left out, so that a simulation that takes
-    the place of an observation exceeds the limit with :func:`chance_of_flag`. A tuned g
-    averages over the simulator's noise, and may put observations between simulations,
-    such as between the categories of an entry. The limit allows for that.
+    The limit is exceeded by one in a thousand simulations that take the place of
+    observations. A tuned g averages over the simulator's noise, and may put
+    observations between simulations, such as between the categories of an entry. The
+    limit allows for that.
     """
     embedded, averaged = simulations.embedded, simulations.averaged
     # A new value exceeds the (k+1)-th largest of n with probability (k + 1) / (n + 1).
@@ -176,11 +172,6 @@ def distances(real: Tensor, simulations: Simulations) -> Tensor:
     return nearest_distances(real, embedded) / max(limit, smallest)
 
 
-def chance_of_flag(num_simulations: int) -> float:
-    """Return the probability that a simulation is farther away than the limit."""
-    return (int(FLAGGED_SHARE * num_simulations) + 1) / (num_simulations + 1)
-
-
 def unmatched(distance: Tensor, num_simulations: int) -> Finding:
     """Say how many observations have no simulation near them.
 
@@ -188,7 +179,8 @@ def unmatched(distance: Tensor, num_simulations: int) -> Finding:
     observation that is very far away is an alarm by itself.
     """
     count, flags = len(distance), (distance > 1).nonzero().flatten().tolist()
-    allowed = float(binom.ppf(0.99, count, chance_of_flag(num_simulations)))
+    chance = (int(FLAGGED_SHARE * num_simulations) + 1) / (num_simulations + 1)
+    allowed = float(binom.ppf(0.99, count, chance))
     value, threshold, farthest = float(len(flags)), allowed, float(distance.max())
     sentence = (
         f"{len(flags)} of {count} observations have no simulation near them (by chance "
@@ -217,12 +209,9 @@ def effective_sizes(coupling: Coupling, num_simulations: int) -> Finding:
         sentence += " Raise `num_simulations` or gamma."
     elif median > INDISTINCT * num_simulations:
         value, threshold = median / num_simulations, INDISTINCT
-        sentence += " This is almost the prior. " + (
-            "A smaller gamma separates the observations."
-            if len(sizes) > 1
-            # The sums of the columns are given, and a single row has to have them.
-            else "At tau=1 a single observation has the prior for any gamma. Couple it "
-            "with others, or use `stack(rope)`, which needs no batch."
+        sentence += (
+            " This is almost the prior. Lower gamma, or, for a single observation, use "
+            "`stack(rope)`, which needs no batch."
         )
     if not coupling.converged:
         sentence += " The coupling has not converged, so that this is approximate."

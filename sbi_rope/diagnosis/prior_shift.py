@@ -18,9 +18,8 @@ __all__ = ["prior_shift", "shifts"]
 # At tau = 0 each observation is coupled by itself, without trust in the prior. The
 # smaller gamma is, the less the implied distribution is blurred.
 COUPLER = SinkhornCoupler(gamma=0.1, tau=0.0, cost_scale="simulated")
-# The largest number of simulations that take the place of observations, and the number
-# of batches that are drawn from them.
-MAX_PLAYERS, NUM_DRAWS = 1000, 1000
+# The largest number of simulations that take the place of observations.
+MAX_PLAYERS = 1000
 ERROR_QUANTILE = 0.95
 LEARNED = "This is expected: the stack has learned it from the pairs."
 
@@ -69,10 +68,9 @@ def prior_shift(
         ends.append(implied_by(coupling, unmoved, theta, others=True)[1])
     chances = []
     for end in ends:
-        batches = resampled(end, len(real), num_draws=NUM_DRAWS)
         # The expectation is itself a mean over simulations, with its own uncertainty.
-        references = resampled(expected, len(expected), num_draws=NUM_DRAWS)
-        gaps = _largest_gap(batches, references)
+        batches = resampled(end, len(real)), resampled(expected, len(expected))
+        gaps = (batches[0] - batches[1]).abs().amax(dim=-1)
         chances.append(gaps.quantile(1.0 - LEVEL / theta.shape[1], dim=0))
     threshold = torch.stack(chances).amax(dim=0)
     if held_out is not None:
@@ -81,9 +79,9 @@ def prior_shift(
         _, wanted = implied_by(coupling, targets, theta)
         # With few groups the errors could be small by chance, hence a bootstrap.
         difference = held_out.mean_of_groups(found - wanted)
-        means = resampled(difference, len(difference), num_draws=NUM_DRAWS)
+        means = resampled(difference, len(difference))
         threshold = threshold + means.abs().amax(dim=-1).quantile(ERROR_QUANTILE, dim=0)
-    distance = _largest_gap(functions.mean(dim=0), expected.mean(dim=0))
+    distance = (functions.mean(dim=0) - expected.mean(dim=0)).abs().amax(dim=-1)
     return PriorShift(distance, threshold, implied, unshifted)
 
 
@@ -97,11 +95,11 @@ def shifts(
 
     A shift of parameters whose names are ``learned`` is no alarm.
     """
-    theta = simulations.theta
-    mean, spread = _moments(theta, shift.implied)
-    usual_mean, usual_spread = _moments(theta, shift.unshifted)
-    move = ((mean - usual_mean) / divisors(theta.std(dim=0))).tolist()
-    ratio = (spread / divisors(usual_spread)).tolist()
+    theta, weights = simulations.theta, torch.stack([shift.implied, shift.unshifted])
+    standard = (theta - theta.mean(dim=0)) / divisors(theta.std(dim=0))
+    mean = weights @ standard
+    spread = (weights @ standard.square() - mean.square()).clamp_min(0.0).sqrt()
+    move, ratio = mean[0] - mean[1], spread[0] / divisors(spread[1])
     doubt = "Without calibration pairs, misspecification looks the same."
     if simulations.tuned:
         doubt = "In RoPE, lower tau. A stack needs pairs that are drawn like the batch."
@@ -118,20 +116,11 @@ def shifts(
         if is_shifted:
             higher = "higher" if move[k] > 0 else "lower"
             sentence = (
-                f"The batch has other values of {name} than the prior ({numbers}). "
-                f"Their mean is at least {abs(move[k]):.2f} prior standard deviations "
-                f"{higher}, and their spread about {ratio[k]:.2f} times as large. "
-                f"{LEARNED if name in learned else doubt}"
+                f"The batch seems to differ from the prior in {name} ({numbers}). "
+                f"The mean is at least {abs(move[k]):.2f} prior standard deviations "
+                f"{higher}, and the spread {ratio[k]:.2f} times the usual. "
             )
+            sentence += LEARNED if name in learned else doubt
         alarming = is_shifted and name not in learned
         found.append(Finding(test, sentence, alarming, distance, threshold))
     return found
-
-
-def _largest_gap(a: Tensor, b: Tensor) -> Tensor:
-    return (a - b).abs().amax(dim=-1)
-
-
-def _moments(theta: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    mean = weights @ theta
-    return mean, (weights @ (theta - mean).square()).sqrt()

@@ -1,8 +1,7 @@
 """A diagnosis: its findings in words and numbers, and the arrays behind them."""
 
 import textwrap
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import dataclass, field
 
 from torch import Tensor
 
@@ -43,7 +42,8 @@ class Diagnosis:
     of a name. All tensors are float64 on the CPU unless said otherwise.
 
     Attributes:
-        findings: What the tests found that concern the posterior in use.
+        findings: What the tests found that concern the posterior in use; ready for
+            ``pandas.DataFrame``.
         distance: Distance from :math:`g(x_o)` to the nearest simulation, ``(n_o,)``, in
             units of the limit above which an observation is flagged.
         theta: The parameters of the simulations, ``(n_s, d)``.
@@ -83,10 +83,6 @@ class Diagnosis:
     def __getitem__(self, name: str) -> Finding:
         """Return the finding of a name."""
         return {one.name: one for one in self.findings}[name]
-
-    def as_rows(self) -> list[dict[str, Any]]:
-        """Return a row for each finding, ready for a dataframe."""
-        return [asdict(one) for one in self.findings]
 
     def __str__(self) -> str:
         count = len(self.distance)

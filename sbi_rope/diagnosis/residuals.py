@@ -15,13 +15,7 @@ from sbi_rope.diagnosis.simulations import Simulations
 from sbi_rope.fit import without_warning_of_few_pairs
 from sbi_rope.rope import RoPE
 
-__all__ = [
-    "HeldOut",
-    "bias_finding",
-    "cross_fit",
-    "dependence",
-    "residual_finding",
-]
+__all__ = ["HeldOut", "bias_finding", "cross_fit", "dependence", "residual_finding"]
 
 NAME = "residual depends on parameters"
 # Averaging over the simulator's noise explains at most this, see `bias_finding`.
@@ -34,8 +28,7 @@ class HeldOut(NamedTuple):
     r"""Pairs embedded by nets g that were not trained on them, and their targets.
 
     ``embedded`` is :math:`g(x)`, and ``targets`` :math:`E[h(S(\theta))]`, ``(n_c, l)``.
-    Pairs of one ``group``, ``(n_c,)``, have errors in common, so that they are not
-    independent evidence.
+    Pairs of one ``group``, ``(n_c,)``, are not independent: their errors are alike.
     """
 
     embedded: Tensor
@@ -114,11 +107,11 @@ def residual_finding(
     pairs: Pairs, held_out: HeldOut | None, simulations: Simulations
 ) -> Finding:
     """Say whether residuals of the pairs depend on their parameters."""
+    if not num_features(pairs.num_groups, pairs.theta.shape[-1]):
+        few = f"{pairs.num_groups} different labels (or groups) are too few"
+        return Finding(NAME, f"Not tested, because {few}.")
     if held_out is None:
-        why = "`num_folds` is None"
-        if pairs.num_groups < 2:
-            why = "there are no two calibration pairs with different labels (or groups)"
-        return Finding(NAME, f"Not tested, because {why}.")
+        return Finding(NAME, "Not tested, because `num_folds` is None.")
     theta = pairs.mean.detach().cpu().double()
     residuals = held_out.embedded - held_out.targets
     labels = torch.stack([pairs.group, pairs.label.group]).unique(dim=1)
@@ -127,11 +120,7 @@ def residual_finding(
         chosen = one_of_each_group(held_out.group, seed=0)
         theta, residuals = theta[chosen], residuals[chosen]
     else:
-        theta = held_out.mean_of_groups(theta)
-        residuals = held_out.mean_of_groups(residuals)
-    if not num_features(*theta.shape):
-        why = f"{len(theta)} different labels (or groups) are too few"
-        return Finding(NAME, f"Not tested, because {why}.")
+        theta, residuals = map(held_out.mean_of_groups, (theta, residuals))
     return bias_finding(residuals, theta, simulations)
 
 

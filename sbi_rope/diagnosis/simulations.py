@@ -13,13 +13,13 @@ __all__ = ["Simulations", "implied_by", "nearest_distances", "resampled"]
 
 # Points at which distribution functions are compared.
 NUM_POINTS = 100
-
 # So many simulations give a covariance with errors of a few per cent.
 MAX_FOR_NOISE = 2000
 CHUNK = 500
+NUM_DRAWS = 1000  # of batches of simulations
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class Simulations:
     r"""Simulations from the prior, in float64 on the CPU.
 
@@ -116,12 +116,12 @@ def implied_by(
     return total / len(points), torch.cat(functions)
 
 
-def resampled(values: Tensor, size: int, *, num_draws: int) -> Tensor:
-    """Return means over ``size`` rows drawn with replacement, ``(num_draws, ...)``."""
+def resampled(values: Tensor, size: int) -> Tensor:
+    """Return means over ``size`` rows drawn with replacement, ``(1000, ...)``."""
     count = len(values)
-    rows = torch.randint(count, (num_draws, size))
-    rows += count * torch.arange(num_draws).unsqueeze(1)
-    times = torch.bincount(rows.flatten(), minlength=num_draws * count)
-    draws = times.reshape(num_draws, count).to(values)
+    rows = torch.randint(count, (NUM_DRAWS, size))
+    rows += count * torch.arange(NUM_DRAWS).unsqueeze(1)
+    times = torch.bincount(rows.flatten(), minlength=NUM_DRAWS * count)
+    draws = times.reshape(NUM_DRAWS, count).to(values)
     mean = draws @ values.reshape(count, -1) / size
-    return mean.reshape(num_draws, *values.shape[1:])
+    return mean.reshape(NUM_DRAWS, *values.shape[1:])
