@@ -3,13 +3,7 @@
 import math
 from collections.abc import Sequence
 
-from sbi_rope.diagnosis import Diagnosis, Finding
-from sbi_rope.diagnosis.report import (
-    IN_BRIEF,
-    OF_OTHERS,
-    whom_it_concerns,
-    why_expected,
-)
+from sbi_rope.diagnosis import Diagnosis
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.discrepancy.report import what_groups_count_as, what_outliers_mean
 from sbi_rope.metrics import CoverageCurve
@@ -248,7 +242,7 @@ def no_discrepancy_section(report: StackingReport) -> str:
 
 def diagnosis_section(diagnosis: Diagnosis, names: Sequence[str]) -> str:
     """Return the findings about a batch."""
-    shown = (*diagnosis.unexpected, *diagnosis.expected)
+    others = [one for one in diagnosis.findings if not one.alarming]
     return section(
         "Diagnosis of the batch",
         paragraph(
@@ -257,17 +251,10 @@ def diagnosis_section(diagnosis: Diagnosis, names: Sequence[str]) -> str:
         ),
         *_other_names(diagnosis.parameter_names, names),
         *(
-            finding(
-                result.name,
-                result.number,
-                _in_words(result),
-                alarming=not result.is_expected,
-            )
-            for result in shown
+            finding(one.name, "", one.sentence, alarming=True)
+            for one in diagnosis.alarming
         ),
-        *_no_alarm(diagnosis.quiet),
-        *_of_others(diagnosis.others),
-        *(paragraph(note, kind="note") for note in diagnosis.notes),
+        table(("no alarm", ""), [(one.name, one.sentence) for one in others]),
         picture(
             implied_parameters(diagnosis),
             caption="The parameters that the batch implies, beside the prior.",
@@ -284,39 +271,3 @@ def _other_names(own: Sequence[str], names: Sequence[str]) -> list[str]:
         if before != name
     ]
     return [paragraph(f"In this section {', '.join(renamed)}.")] if renamed else []
-
-
-def _in_words(result: Finding) -> str:
-    if result.is_expected:
-        return f"{result.sentence} It is as expected {why_expected(result)}."
-    return f"{result.sentence} {whom_it_concerns(result)}"
-
-
-def _no_alarm(quiet: Sequence[Finding]) -> list[str]:
-    if not quiet:
-        return []
-    return [
-        paragraph("No alarm:"),
-        table(
-            ("finding", "number", "whose posterior it would be about"),
-            [
-                (result.name, result.number, IN_BRIEF[result.concerns])
-                for result in quiet
-            ],
-        ),
-    ]
-
-
-def _of_others(others: Sequence[Finding]) -> list[str]:
-    if not others:
-        return []
-    return [
-        paragraph(f"{OF_OTHERS[0].upper()}{OF_OTHERS[1:]}:"),
-        table(
-            ("finding", "number", "alarming"),
-            [
-                (result.name, result.number, "yes" if result.alarming else "no")
-                for result in others
-            ],
-        ),
-    ]

@@ -6,7 +6,6 @@ from os import PathLike
 from pathlib import Path
 
 from sbi_rope.diagnosis import Diagnosis
-from sbi_rope.diagnosis.report import read_for
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.errors import InvalidInputError, shown
 from sbi_rope.plots._figures import new_figure
@@ -83,9 +82,6 @@ def write_stacking_report(
     check("diagnosis", diagnosis, Diagnosis | None)
     names = _parameter_names(report, diagnosis, parameter_names)
     discrepancy = _named(report.discrepancy, x_names)
-    if diagnosis is not None:
-        # The page is about this stack, whichever posterior the diagnosis was made for.
-        diagnosis = read_for(diagnosis, report)
     parts = [
         paragraph(_what_was_done(report)),
         verdict(verdict_of(report, diagnosis, names)),

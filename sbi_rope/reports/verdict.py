@@ -50,7 +50,7 @@ def verdict_of(
             (
                 f"The diagnosis of a batch of {len(diagnosis.distance)} measurements: "
                 f"{diagnosis.verdict}",
-                bool(diagnosis.unexpected),
+                bool(diagnosis.alarming),
             )
         )
     return lines
@@ -109,7 +109,9 @@ def _compared_batches(
         found.append(
             ("The batch of unlabelled measurements", test.p_value, test.is_different)
         )
-    if diagnosis is not None and UNLIKE_PAIRS in diagnosis:
+    if diagnosis is not None:
         finding = diagnosis[UNLIKE_PAIRS]
-        found.append(("The batch of the diagnosis", finding.value, finding.alarming))
+        if finding.value is not None:
+            whose = "The batch of the diagnosis"
+            found.append((whose, finding.value, finding.alarming))
     return found

@@ -13,7 +13,7 @@ import torch
 from sbi_rope import diagnose, load
 from sbi_rope._statistics import TwoSampleTest
 from sbi_rope.diagnosis import Diagnosis, Finding
-from sbi_rope.diagnosis.report import UNLIKE_PAIRS, read_for
+from sbi_rope.diagnosis.report import UNLIKE_PAIRS
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.reports.page import number, percent
 from sbi_rope.stacking import LearningCurve, StackingReport
@@ -191,15 +191,10 @@ def test_the_page_says_what_a_diagnosis_found(
 ) -> None:
     text = Page(source).text
     assert "Diagnosis of the batch" in text
-    shown = read_for(diagnosis, the_stack().report)
-    for finding in shown.findings:
-        sentence = finding.sentence.replace(" %", "\N{NO-BREAK SPACE}%")
-        is_told = finding.alarming and finding not in shown.others
-        assert (sentence in text) == is_told
-        assert finding.number in text
-    assert text.count("Alarming: ") == len(shown.unexpected)
-    assert shown.verdict in text
-    assert all(note.split(".")[0] in text for note in diagnosis.notes)
+    for finding in diagnosis.findings:
+        assert finding.sentence.replace(" %", "\N{NO-BREAK SPACE}%") in text
+    assert text.count("Alarming: ") == len(diagnosis.alarming)
+    assert diagnosis.verdict in text
     # Its sentences have names of their own, which the page explains.
     assert f"In this section theta_1 is {NAMES[0]}, theta_2 is {NAMES[1]}." in text
 
@@ -222,7 +217,7 @@ def test_the_verdict_holds_the_comparison_of_a_diagnosis(
     assert "The batch of the diagnosis differs from them (p = 0.003)" in text
     text = verdict((*others, replace(unlike, alarming=False, value=0.4)))
     assert "The batch of the diagnosis shows no sign of a difference (p = 0.40)" in text
-    text = verdict(others)
+    text = verdict((*others, replace(unlike, alarming=False, value=None)))
     assert "Whether the batch of the diagnosis is like them was not tested" in text
     assert "This report does not compare" not in text
 
