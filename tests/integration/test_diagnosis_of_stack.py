@@ -80,12 +80,10 @@ def test_a_shift_that_the_pairs_do_not_show_is_an_alarm_about_the_stack(
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("change", ["keep_prior", "probability_of_prior"])
 def test_a_shift_is_an_alarm_where_the_stack_has_not_learned_it(
-    rope: RoPE, stack: StackedPosterior, change: str
+    rope: RoPE, stack: StackedPosterior
 ) -> None:
-    names = stack.report.cross_validation.names
-    value = {"keep_prior": names, "probability_of_prior": 0.3}[change]
-    other = copy.copy(stack)
-    other.report = replace(stack.report, **{change: value})
-    assert alarms(look(rope, other)) == SHIFTS
+    other, names = copy.copy(stack), stack.report.cross_validation.names
+    for change in ({"keep_prior": names}, {"probability_of_prior": 0.3}):
+        other.report = replace(stack.report, **change)
+        assert alarms(look(rope, other)) == SHIFTS
