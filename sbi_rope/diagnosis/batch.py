@@ -64,8 +64,8 @@ def diagnose(
        :math:`\theta`? They are computed on pairs that g was not trained on.
 
     The last four are about RoPE only. Without calibration pairs g is h, and 1, 5 and 8
-    are left out. Of batches that fulfil the assumption, one in a hundred is an alarm of
-    1, and so for 3, 4, 5 and 6. The thresholds of 7 are rules of thumb about gamma.
+    are left out. Each of 1, 3, 4, 5 and 6 is alarming by chance in one batch of a
+    hundred. The thresholds of 7 are rules of thumb about gamma.
 
     Args:
         rope: A RoPE, which is not changed. If calibration pairs were appended but not

@@ -25,8 +25,7 @@ __all__ = [
     "unmatched",
 ]
 
-# The largest numbers of observations and simulations in one MMD, whose cost is
-# quadratic.
+# The most observations and simulations in one MMD, whose cost is quadratic.
 MAX_OBSERVATIONS, MAX_SIMULATIONS = 200, 400
 NUM_DRAWS = 200
 # An observation is flagged if its nearest simulation is farther away than the nearest
@@ -156,7 +155,7 @@ def far_entries(embedding_net: nn.Module, x_o: Tensor) -> Finding:
 def distances(real: Tensor, simulations: Simulations) -> Tensor:
     """Return how far ``real`` is from the nearest simulation, where 1 is the limit.
 
-    The limit is exceeded by one in a thousand simulations that take the place of
+    One or two in a thousand simulations exceed the limit if they take the place of
     observations. A tuned g averages over the simulator's noise, and may put
     observations between simulations, such as between the categories of an entry. The
     limit allows for that.
