@@ -1,6 +1,6 @@
 """Test whether the residuals of calibration pairs depend on their parameters."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -8,85 +8,50 @@ from torch import Tensor
 from sbi_rope._prior import divisors
 from sbi_rope._progress import progress_bar
 from sbi_rope._sbi import embed
-from sbi_rope._statistics import permutation_test
-from sbi_rope.data import group_means, one_of_each_group
+from sbi_rope._statistics import LEVEL, permutation_test
+from sbi_rope.data import Pairs, one_of_each_group
 from sbi_rope.diagnosis.report import Finding
 from sbi_rope.diagnosis.simulations import Simulations
 from sbi_rope.fit import without_warning_of_few_pairs
 from sbi_rope.rope import RoPE
 
-__all__ = [
-    "CrossFitted",
-    "cross_fit",
-    "dependence",
-    "residual_finding",
-    "residual_findings",
-]
+__all__ = ["HeldOut", "bias_finding", "cross_fit", "dependence", "residual_finding"]
 
-LEVEL = 0.01
-# Averaging over the simulator's noise explains at most this, see `residual_finding`.
+NAME = "residual depends on parameters"
+# Averaging over the simulator's noise explains at most this, see `bias_finding`.
 LARGEST_RATIO = 0.5
 # Without noise, a bias is measured in units of this share of the embeddings' spread.
 SMALLEST_SHARE = 0.05
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class CrossFitted:
-    r"""Calibration pairs, embedded by nets g that were not trained on them.
+class HeldOut(NamedTuple):
+    r"""Pairs embedded by nets g that were not trained on them, and their targets.
 
-    Attributes:
-        embedded: :math:`g(x)`, ``(n_c, l)``.
-        targets: :math:`E[h(S(\theta))]`, ``(n_c, l)``.
-        people: Which pairs are of the same person or specimen. Such pairs have errors
-            in common, so that they are not independent evidence.
+    ``embedded`` is :math:`g(x)`, and ``targets`` :math:`E[h(S(\theta))]`, ``(n_c, l)``.
+    Pairs of one ``group``, ``(n_c,)``, are not independent: their errors are alike.
     """
 
     embedded: Tensor
     targets: Tensor
-    people: Tensor | None = None
+    group: Tensor
 
-    @property
-    def residuals(self) -> Tensor:
-        """The differences between the two, ``(n_c, l)``."""
-        return self.embedded - self.targets
-
-    def of_people(self, values: Tensor) -> Tensor:
-        """Return the mean of each person of values of the pairs, ``(n_c, ...)``."""
-        if self.people is None:
-            return values
-        return group_means(values, torch.ones(len(values)), self.people)[0]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Dependence:
-    """How much residuals depend on parameters.
-
-    Attributes:
-        p_value: The p-value of a permutation test.
-        bias: Root mean square of the part of the residuals that depends on theta.
-        error: Standard error of ``bias``.
-    """
-
-    p_value: float
-    bias: float
-    error: float
+    def mean_of_groups(self, values: Tensor) -> Tensor:
+        """Return the mean of each group of values of the pairs, ``(n_c, ...)``."""
+        member = (self.group.unique()[:, None] == self.group).to(values)
+        return torch.tensordot(member / member.sum(dim=1, keepdim=True), values, dims=1)
 
 
 def num_features(num_pairs: int, dim: int) -> int:
     """Return how many features of the parameters to regress on; 0 if pairs are few."""
-    for count in (2 * dim, dim):
-        if num_pairs >= 2 * (count + 1) + 2:
-            return count
-    return 0
+    return next((p for p in (2 * dim, dim) if num_pairs >= 2 * (p + 1) + 2), 0)
 
 
-def cross_fit(rope: RoPE, *, num_folds: int, show_progress_bars: bool) -> CrossFitted:
+def cross_fit(rope: RoPE, *, num_folds: int, show_progress_bars: bool) -> HeldOut:
     r"""Embed each calibration pair by a g that was trained on the other folds.
 
-    The residuals of pairs that g was trained on would be too small. There is one
-    training for each fold. Where labels are not exact, g is tuned to averages given the
-    label alone, other than by :meth:`RoPE.train`, because residuals from averages that
-    are also given x would be too small.
+    Where labels are not exact, g is tuned to averages given the label alone, other than
+    by :meth:`RoPE.train`: residuals from averages that are also given x would be too
+    small, as they would be of pairs that g was trained on.
     """
     pairs, h = rope.pairs, rope.embedding_net
     targets = rope.draw_targets(
@@ -108,23 +73,24 @@ def cross_fit(rope: RoPE, *, num_folds: int, show_progress_bars: bool) -> CrossF
                 show_progress_bars=False,
             )
         embedded[held_out] = embed(result.embedding_net, pairs.x[held_out])
-    return CrossFitted(
+    return HeldOut(
         embedded=embedded.cpu().double(),
         targets=targets.cpu().double(),
-        people=pairs.group.cpu(),
+        group=pairs.group.cpu(),
     )
 
 
-def dependence(residuals: Tensor, theta: Tensor) -> Dependence:
-    r"""Regress residuals on parameters and their squares, with a permutation test.
+def dependence(residuals: Tensor, theta: Tensor) -> tuple[float, float, float]:
+    r"""Regress residuals ``(n, l)`` on parameters ``(n, d)`` and their squares.
 
-    The statistic is the sum of squares that the regression explains. With p features
-    and residual variance :math:`s^2`, the bias b is estimated by
-    :math:`b^2 = (\text{explained} - p\, s^2) / n`, which is unbiased. If pairs are few,
-    the squares of the parameters are left out. The standard error of b is at most about
-    :math:`\sqrt{(s^2 + b^2 / 2) / n}`, its value if all residual variance has the
-    direction of the bias.
-    Shapes are ``(n, l)`` and ``(n, d)``.
+    With p features that explain a sum of squares, and residual variance :math:`s^2`,
+    the bias b is estimated by :math:`b^2 = (\text{explained} - p\, s^2) / n`, which is
+    unbiased. If pairs are few, the squares of the parameters are left out. The standard
+    error of b is at most about :math:`\sqrt{(s^2 + b^2 / 2) / n}`, its value if all
+    residual variance has the direction of the bias.
+
+    Returns:
+        The p-value of a permutation test, b, and its standard error.
     """
     count = num_features(*theta.shape)
     standard = (theta - theta.mean(dim=0)) / divisors(theta.std(dim=0))
@@ -134,40 +100,31 @@ def dependence(residuals: Tensor, theta: Tensor) -> Dependence:
     total = float((residuals - residuals.mean(dim=0)).square().sum())
     variance = (total - found.explained) / (n - 1 - p)
     square = max(found.explained - p * variance, 0.0) / n
-    return Dependence(
-        p_value=found.p_value,
-        bias=square**0.5,
-        error=((variance + square / 2) / n) ** 0.5,
-    )
-
-
-def residual_findings(
-    rope: RoPE, held_out: CrossFitted, simulations: Simulations, notes: list[str]
-) -> list[Finding]:
-    """Return a finding about calibration pairs, or note why they are too few."""
-    pairs = rope.pairs
-    theta = pairs.mean.detach().cpu().double()
-    residuals = held_out.residuals
-    labels = torch.stack([pairs.group, pairs.label.group]).unique(dim=1)
-    if labels.shape[1] > pairs.num_groups:
-        # The mean over parameters that differ would depend on them less.
-        chosen = one_of_each_group(pairs.group.cpu(), seed=0)
-        theta, residuals = theta[chosen], residuals[chosen]
-    else:
-        theta, residuals = held_out.of_people(theta), held_out.of_people(residuals)
-    if num_features(*theta.shape):
-        return [residual_finding(residuals, theta, simulations)]
-    notes.append(
-        f"Whether residuals depend on parameters was not tested: {len(theta)} "
-        "calibration pairs with different labels (or groups) are too few for "
-        f"{theta.shape[1]} parameters."
-    )
-    return []
+    return found.p_value, square**0.5, ((variance + square / 2) / n) ** 0.5
 
 
 def residual_finding(
-    residuals: Tensor, theta: Tensor, simulations: Simulations
+    pairs: Pairs, held_out: HeldOut | None, simulations: Simulations
 ) -> Finding:
+    """Say whether residuals of the pairs depend on their parameters."""
+    if not num_features(pairs.num_groups, pairs.theta.shape[-1]):
+        few = f"{pairs.num_groups} different labels (or groups) are too few"
+        return Finding(NAME, f"Not tested, because {few}.")
+    if held_out is None:
+        return Finding(NAME, "Not tested, because `num_folds` is None.")
+    theta = pairs.mean.detach().cpu().double()
+    residuals = held_out.embedded - held_out.targets
+    labels = torch.stack([pairs.group, pairs.label.group]).unique(dim=1)
+    if labels.shape[1] > pairs.num_groups:
+        # The mean over parameters that differ would depend on them less.
+        chosen = one_of_each_group(held_out.group, seed=0)
+        theta, residuals = theta[chosen], residuals[chosen]
+    else:
+        theta, residuals = map(held_out.mean_of_groups, (theta, residuals))
+    return bias_finding(residuals, theta, simulations)
+
+
+def bias_finding(residuals: Tensor, theta: Tensor, simulations: Simulations) -> Finding:
     r"""Return a finding about the bias, its lower 95 % limit, in units of the noise.
 
     Residuals depend on the parameters even if nothing is wrong. Let :math:`h` be the
@@ -176,40 +133,21 @@ def residual_finding(
     simulations has the variance :math:`R (1 - R)`. The ratio is
     :math:`\sqrt{R (1 - R)} \le 1/2`.
     """
-    found = dependence(residuals, theta)
+    p_value, bias, error = dependence(residuals, theta)
     spread = float(simulations.embedded.var(dim=0).sum())
     noise = float(simulations.noise.trace())
-    unit = max(noise, SMALLEST_SHARE**2 * spread) ** 0.5
-    lower = max(found.bias - 1.645 * found.error, 0.0)
-    value = lower / unit if unit else float(lower > 0)
-    significant = found.p_value < LEVEL
-    alarming = significant and value > LARGEST_RATIO
-    if alarming:
-        sentence = (
-            "The residuals of calibration pairs after tuning depend on the parameters: "
-            f"the bias is at least {value:.2f} times the simulator's noise (p = "
-            f"{found.p_value:.3f}). Either tuning has not generalised, because there "
-            "are too few pairs or the training was too short, or real observations do "
-            "not follow the parameters as simulations do. Then the conditional "
-            "independence that RoPE assumes does not hold."
-        )
-    else:
-        sentence = (
-            "The residuals of calibration pairs after tuning have a bias of "
-            f"{found.bias / unit if unit else 0.0:.2f} times the simulator's noise "
-            f"(p = {found.p_value:.3f}), which is "
-            + ("normal." if significant else "not significant.")
-        )
-    return Finding(
-        name="residual depends on parameters",
-        value=value,
-        threshold=LARGEST_RATIO,
-        alarming=alarming,
-        concerns="RoPE",
-        sentence=sentence,
-        reason=(
-            "Alarming if the lower 95 % limit of the ratio is above the threshold and "
-            "p is below 0.01: in a linear-Gaussian problem, averaging over the "
-            "simulator's noise alone gives a ratio of up to one half."
-        ),
+    unit = max(noise, SMALLEST_SHARE**2 * spread) ** 0.5 or 1.0
+    value = max(bias - 1.645 * error, 0.0) / unit
+    alarming = p_value < LEVEL and value > LARGEST_RATIO
+    sentence = (
+        f"The bias that depends on the parameters is {bias / unit:.2g} times the "
+        f"simulator's noise (p = {p_value:.2g}); averaging over noise gives up to "
+        f"{LARGEST_RATIO}."
     )
+    if alarming:
+        sentence += (
+            " Either there are too few pairs for tuning, or real observations do not "
+            "follow the parameters as simulations do, which RoPE assumes. Append more "
+            "pairs, or use `stack`, which does not assume it."
+        )
+    return Finding(NAME, sentence, alarming, value, LARGEST_RATIO)

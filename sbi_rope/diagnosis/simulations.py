@@ -7,29 +7,19 @@ import torch
 from torch import Tensor
 
 from sbi_rope._prior import divisors
-from sbi_rope.coupling import Coupling, SinkhornCoupler
+from sbi_rope.coupling import Coupling
 
-__all__ = [
-    "Implied",
-    "Simulations",
-    "couple_by_itself",
-    "implied_by",
-    "nearest_distances",
-    "resampled",
-]
+__all__ = ["Simulations", "implied_by", "nearest_distances", "resampled"]
 
-# At tau = 0 each observation is coupled by itself, without trust in the prior. The
-# smaller gamma is, the less the implied distribution is blurred.
-COUPLER = SinkhornCoupler(gamma=0.1, tau=0.0, cost_scale="simulated")
 # Points at which distribution functions are compared.
 NUM_POINTS = 100
-
 # So many simulations give a covariance with errors of a few per cent.
 MAX_FOR_NOISE = 2000
 CHUNK = 500
+NUM_DRAWS = 1000  # of batches of simulations
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class Simulations:
     r"""Simulations from the prior, in float64 on the CPU.
 
@@ -43,17 +33,13 @@ class Simulations:
     embedded: Tensor
     tuned: bool
 
-    def __len__(self) -> int:
-        return len(self.theta)
-
     @cached_property
     def noise(self) -> Tensor:
         r"""Covariance :math:`W` of :math:`h(x_s)` given theta, ``(l, l)``.
 
-        It is estimated from the differences between simulations with neighbouring
-        parameters, after a quadratic trend is subtracted. No further simulations are
-        needed. With many parameters and few simulations, neighbours are far apart and
-        the estimate is too large.
+        It is estimated from differences between simulations with neighbouring
+        parameters, without a quadratic trend. With many parameters and few simulations,
+        neighbours are far apart and the estimate is too large.
         """
         theta, embedded = self.theta[:MAX_FOR_NOISE], self.embedded[:MAX_FOR_NOISE]
         standard = (theta - theta.mean(dim=0)) / divisors(theta.std(dim=0))
@@ -73,10 +59,8 @@ class Simulations:
         r"""Move embeddings ``(n, l)`` as tuning does if nothing is wrong.
 
         Tuning moves :math:`g(x)` towards :math:`E[h \mid \theta]`. It can reach at best
-        the mean of this given x, which averages out the noise of single simulations
-        and is drawn to the centre. To first order it is
-        :math:`\mu + (I - W V^{-1})(h - \mu)`, with V the covariance of h. Without
-        tuning, h is not changed.
+        the mean of this given x, to first order :math:`\mu + (I - W V^{-1})(h - \mu)`,
+        with V the covariance of h. Without tuning, h is not changed.
         """
         if not self.tuned:
             return points
@@ -94,76 +78,50 @@ class Simulations:
 def nearest_distances(points: Tensor, among: Tensor, *, others: bool = False) -> Tensor:
     """Return the distance from each point to the nearest of others, shape ``(n,)``.
 
-    With ``others`` the two sets are the same, and no point is its own neighbour.
+    With ``others`` a point is compared with all but the one in its own row.
     """
     nearest = []
-    for first in range(0, len(points), CHUNK):
-        distance = torch.cdist(points[first : first + CHUNK], among)
+    for rows in torch.arange(len(points)).split(CHUNK):
+        distance = torch.cdist(points[rows], among)
         if others:
-            own = torch.arange(len(distance))
-            distance[own, first + own] = torch.inf
+            distance.scatter_(1, rows[:, None], torch.inf)
         nearest.append(distance.amin(dim=1))
     return torch.cat(nearest)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Implied:
-    """The parameters that the observations of a set imply.
-
-    Attributes:
-        weights: Mean weights of the simulations, which sum to one, ``(n_s,)``.
-        functions: The distribution functions of each observation, at points of each
-            parameter, ``(n, d, points)``.
-    """
-
-    weights: Tensor
-    functions: Tensor
-
-
-def couple_by_itself(simulations: Simulations) -> Coupling:
-    """Return a coupling whose rows depend on one observation only."""
-    # At tau = 0 the potential is zero for any batch, so that a few rows are enough.
-    return COUPLER.couple(simulations.embedded[:100], simulations.embedded)
-
-
 def implied_by(
-    coupling: Coupling,
-    real: Tensor,
-    simulations: Simulations,
-    *,
-    own: Tensor | None = None,
-) -> Implied:
-    r"""Return the parameters that embeddings imply.
+    coupling: Coupling, points: Tensor, theta: Tensor, *, others: bool = False
+) -> tuple[Tensor, Tensor]:
+    r"""Return the parameters that embeddings ``(n, l)`` imply.
 
-    Observation i gives simulation j the weight
-    :math:`\operatorname{softmax}_j(-C_{ij} / \gamma)`. For simulations that take the
-    place of observations, ``own`` are their numbers, and none is matched with itself.
+    Point i gives simulation j the weight :math:`\operatorname{softmax}_j(-C_{ij} /
+    \gamma)`. With ``others`` it is not matched with the simulation in its own row.
+
+    Returns:
+        The mean weights of the simulations, ``(n_s,)``, which sum to one; and the
+        distribution functions of each point, ``(n, d, NUM_POINTS)``.
     """
-    theta = simulations.theta
     order, last = theta.argsort(dim=0), len(theta) - 1
     # The ranks at which distribution functions are compared.
     where = torch.linspace(0, last, min(NUM_POINTS, len(theta))).round().long()
-    total = torch.zeros(len(theta), dtype=torch.float64)
-    functions = []
-    for first in range(0, len(real), CHUNK):
-        block = slice(first, first + CHUNK)
-        weights = coupling.rows(real[block])
-        if own is not None:
-            rows = torch.arange(len(weights))
-            weights[rows, own[block]] = 0.0
-            weights = weights / weights.sum(dim=1, keepdim=True).clamp_min(1e-300)
+    total, functions = torch.zeros(len(theta), dtype=torch.float64), []
+    for rows in torch.arange(len(points)).split(CHUNK):
+        weights = coupling.rows(points[rows])
+        if others:
+            weights = weights.scatter(1, rows[:, None], 0.0)
+            weights /= weights.sum(dim=1, keepdim=True).clamp_min(1e-300)
         total += weights.sum(dim=0)
         each = [weights[:, column].cumsum(dim=1)[:, where] for column in order.T]
         functions.append(torch.stack(each, dim=1))
-    return Implied(weights=total / len(real), functions=torch.cat(functions))
+    return total / len(points), torch.cat(functions)
 
 
-def resampled(values: Tensor, size: int, *, num_draws: int) -> Tensor:
-    """Return means over ``size`` rows drawn with replacement, ``(num_draws, ...)``."""
+def resampled(values: Tensor, size: int) -> Tensor:
+    """Return means over ``size`` rows drawn with replacement, ``(1000, ...)``."""
     count = len(values)
-    rows = torch.randint(count, (num_draws, size))
-    rows += count * torch.arange(num_draws).unsqueeze(1)
-    times = torch.bincount(rows.flatten(), minlength=num_draws * count)
-    draws = times.reshape(num_draws, count).to(values)
+    rows = torch.randint(count, (NUM_DRAWS, size))
+    rows += count * torch.arange(NUM_DRAWS).unsqueeze(1)
+    times = torch.bincount(rows.flatten(), minlength=NUM_DRAWS * count)
+    draws = times.reshape(NUM_DRAWS, count).to(values)
     mean = draws @ values.reshape(count, -1) / size
-    return mean.reshape(num_draws, *values.shape[1:])
+    return mean.reshape(NUM_DRAWS, *values.shape[1:])

@@ -40,16 +40,14 @@ def implied_parameters(diagnosis: Diagnosis) -> "Figure":
         The figure, with one panel for each parameter.
     """
     check("diagnosis", diagnosis, Diagnosis)
-    theta, names = diagnosis.theta, diagnosis.parameter_names
-    size = theta.shape[1]
-    weights = {"implied": diagnosis.implied, "unshifted": diagnosis.unshifted}
-    columns = min(size, MAX_COLUMNS)
-    rows = -(-size // columns)
+    names = diagnosis.parameter_names
+    columns = min(len(names), MAX_COLUMNS)
+    rows = -(-len(names) // columns)
     figure = empty_figure(3.4 * columns, 2.7 * rows + 0.5)
     panels = figure.subplots(rows, columns, squeeze=False).flatten()
     for k, axes in enumerate(panels):
-        if k < size:
-            _draw(axes, theta[:, k], diagnosis.prior[:, k], weights)
+        if k < len(names):
+            _draw(axes, diagnosis, k)
             axes.set_xlabel(names[k])
         else:
             axes.set_visible(False)
@@ -58,46 +56,39 @@ def implied_parameters(diagnosis: Diagnosis) -> "Figure":
     return figure
 
 
+def _draw(axes: "Axes", diagnosis: Diagnosis, k: int) -> None:
+    hide_frame(axes)
+    axes.set_yticks([])
+    theta, prior = diagnosis.theta[:, k], diagnosis.prior[:, k]
+    ends = _ends(prior)
+    low, high = ends.tolist()
+    axes.set_xlim(*with_margin(ends[:1], ends[1:])[:, 0].tolist())
+    options = {
+        "bins": torch.linspace(low, high, NUM_BINS + 1, dtype=theta.dtype).tolist(),
+        "density": True,
+    }
+    # The outermost bins hold the tails, so that nothing is cut off. There are many
+    # draws of the prior, so that a flat one looks flat.
+    axes.hist(prior.clamp(low, high).numpy(), color="0.85", label="prior", **options)
+    for weights, colour, line, label in (
+        (diagnosis.unshifted, GREY, "--", "implied by a batch of the prior"),
+        (diagnosis.implied, BLUE, "-", "implied by this batch"),
+    ):
+        axes.hist(
+            theta.clamp(low, high).numpy(),
+            weights=weights.numpy(),
+            histtype="step",
+            color=colour,
+            ls=line,
+            lw=1.6,
+            label=label,
+            **options,
+        )
+
+
 def _ends(prior: Tensor) -> Tensor:
     """Return the range of the prior, or its central 99 % if that is much narrower."""
     whole = torch.stack([prior.min(), prior.max()])
     centre = central_interval(prior.unsqueeze(1))[:, 0]
     is_bounded = whole[1] - whole[0] < 1.1 * (centre[1] - centre[0])
     return whole if is_bounded else centre
-
-
-def _draw(
-    axes: "Axes", theta: Tensor, prior: Tensor, weights: dict[str, Tensor]
-) -> None:
-    hide_frame(axes)
-    axes.set_yticks([])
-    ends = _ends(prior)
-    low, high = ends.tolist()
-    edges = torch.linspace(low, high, NUM_BINS + 1, dtype=theta.dtype).tolist()
-    axes.set_xlim(*with_margin(ends[:1], ends[1:])[:, 0].tolist())
-    # The outermost bins hold the tails, so that nothing is cut off.
-    inside = theta.clamp(low, high).numpy()
-    # There are many draws of the prior, so that a flat one looks flat.
-    axes.hist(
-        prior.clamp(low, high).numpy(),
-        bins=edges,
-        density=True,
-        color="0.85",
-        label="prior",
-    )
-    styles = {
-        "unshifted": (GREY, "--", "implied by a batch of the prior"),
-        "implied": (BLUE, "-", "implied by this batch"),
-    }
-    for name, (colour, line, label) in styles.items():
-        axes.hist(
-            inside,
-            bins=edges,
-            weights=weights[name].numpy(),
-            density=True,
-            histtype="step",
-            color=colour,
-            ls=line,
-            lw=1.6,
-            label=label,
-        )

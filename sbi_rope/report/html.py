@@ -144,7 +144,11 @@ def _parts(report: StackingReport, names: Sequence[str]) -> Iterable[_Part]:
 
 
 def _of_diagnosis(diagnosis: Diagnosis) -> _Part:
-    lines = [(found.sentence, found.alarming) for found in diagnosis.findings]
+    quiet = (one for one in diagnosis.findings if not one.alarming)
+    lines = [
+        (f"{found.name}: {found.sentence}", found.alarming)
+        for found in (*diagnosis.alarming, *quiet)
+    ]
     picture = _encoded(implied_parameters(diagnosis))
     caption = "The parameters that the batch implies, beside the prior."
     return _Part("Diagnosis of the batch", lines, pictures=[(picture, caption)])

@@ -24,7 +24,6 @@ from sbi_rope.errors import (
     SimulationError,
     UnsupportedPosteriorError,
 )
-from sbi_rope.metrics import acauc_of
 from sbi_rope.stacking import (
     Difference,
     DiscrepancyCandidate,
@@ -143,7 +142,9 @@ def test_the_stack_of_each_fold_is_normalised_by_its_own_mass(
     raw = -2 * (2 * torch.stack(widths)[:, 0]).log().double()[scores.fold]
     assert torch.allclose(scores.log_scores[:, 0], raw, atol=1e-5)
     assert torch.allclose(scores.held_out.log_prob, box, atol=0.7)
-    assert float((scores.held_out.log_prob - box).mean()) == pytest.approx(0.0, abs=0.15)
+    assert float((scores.held_out.log_prob - box).mean()) == pytest.approx(
+        0.0, abs=0.15
+    )
 
 
 def test_rows_of_the_table_are_mean_error_and_weight_of_each_candidate() -> None:

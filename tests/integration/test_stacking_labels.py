@@ -119,8 +119,7 @@ def test_labels_of_vanishing_noise_are_scored_like_exact_ones() -> None:
     assert torch.allclose(noisy.held_out.log_prob, exact.held_out.log_prob, atol=0.1)
     # What the stack is normalised by depends on no label.
     mass = [
-        scores.held_out.log_prob - scores.comparable_scores
-        for scores in (exact, noisy)
+        scores.held_out.log_prob - scores.comparable_scores for scores in (exact, noisy)
     ]
     assert float(mass[0].max()) > 0.01
     assert torch.allclose(mass[1], mass[0], atol=0.01)

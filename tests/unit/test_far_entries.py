@@ -1,7 +1,6 @@
 """Entries of x that are far from simulations, or the same in all of them."""
 
 import warnings
-from dataclasses import replace
 
 import pytest
 import torch
@@ -16,8 +15,6 @@ from sbi_rope.baselines import CalibrationMLP, FinetunedNPE, Training
 from sbi_rope.density import average
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import InvalidInputError, RoPEWarning
-from sbi_rope.stacking.cross_validation import Difference
-from sbi_rope.stacking.words import compared, is_comparable
 from tests import problems
 from tests.stacks import DEFAULTS, quick
 
@@ -103,12 +100,6 @@ def test_an_entry_that_varies_only_in_reality_is_named_and_ignored() -> None:
     for before, after in found:
         assert torch.isfinite(before).all()
         assert torch.equal(before, after)
-
-
-def test_a_gain_over_an_arbitrary_density_is_not_comparable() -> None:
-    far = Estimate(mean=5e17, low=-1e18, high=2e18)
-    assert compared(far, "NPE").startswith("not comparable with NPE as it was")
-    assert is_comparable(replace(far, mean=1e3))
 
 
 def test_x_that_is_too_long_without_a_net_is_refused_before_training() -> None:
