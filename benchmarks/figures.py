@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import torch
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from benchmarks.cells import Cell, Suite, data_in_words
 from benchmarks.methods import METHODS, STACK
@@ -17,6 +18,7 @@ from benchmarks.published import LETTERS, Published, finished, relative_ranks
 from benchmarks.store import WHERE, Results
 from sbi_rope import plots
 from sbi_rope._files import write_atomically
+from sbi_rope.plots._figures import empty_figure, hide_frame, new_figure, panel_grid
 
 __all__ = ["LPPAxis", "curves", "draw_all", "draw_overview", "rank_figure"]
 
@@ -86,27 +88,23 @@ def draw_all(suite: Suite, results: Results) -> list[Path]:
     figures = {suite.x_axis: curves(suite.x_axis, rows)}
     figures["calibration"] = _coverage(rows, arrays)
     figures |= _corners(rows, arrays)
-    for name, figure in figures.items():
-        _save(figure, results.folder / f"{name}.png")
-    return [results.folder / f"{name}.png" for name in figures]
+    paths = {results.folder / f"{name}.png": one for name, one in figures.items()}
+    for path, figure in paths.items():
+        _save(figure, path)
+    return list(paths)
 
 
 def draw_overview(published: Published, folder: Path) -> None:
     """Draw scores on all tasks, and ranks over tasks, into a folder."""
     rows = finished(published.main)
-    shown = rows[rows["method"].isin(SHOWN)]
-    order = [*LETTERS]
-    shown = shown.iloc[shown["task"].map(order.index).argsort(kind="stable")]
+    order = {task: place for place, task in enumerate(LETTERS)}
+    shown = rows[rows["method"].isin(SHOWN)].sort_values(
+        "task", kind="stable", key=lambda tasks: tasks.map(order)
+    )
     figure = curves("n_calibration", shown, max_columns=SHOWN_COLUMNS)
     _save(figure, folder / "methods.png")
     ranks = relative_ranks(published.main, beside=STACK)
     _save(rank_figure(ranks), folder / "ranks.png")
-
-
-def _grid(count: int, max_columns: int = MAX_COLUMNS) -> tuple[int, int]:
-    """Return rows and columns for so many panels; wide figures are wrapped."""
-    rows = math.ceil(count / max_columns)
-    return rows, math.ceil(count / rows)
 
 
 def _save(figure: Figure, path: Path) -> None:
@@ -119,8 +117,9 @@ def curves(axis: str, rows: pd.DataFrame, *, max_columns: int = MAX_COLUMNS) -> 
     """Draw LPP and ACAUC against a column, a panel for each task and variant."""
     panels = ["task"] if _is_option(axis) else WHERE
     groups = rows.groupby(panels, sort=False)
-    bands, columns = _grid(len(groups), max_columns)
-    figure = Figure(figsize=(3.1 * columns + 1.9, 5.4 * bands), layout="constrained")
+    bands = math.ceil(len(groups) / max_columns)
+    columns = math.ceil(len(groups) / bands)
+    figure = empty_figure(3.1 * columns + 1.9, 5.4 * bands)
     axes = figure.subplots(2 * bands, columns, squeeze=False, sharex="col")
     # Side by side, as if nothing was wrapped.
     axes = np.concatenate(np.split(axes, bands), axis=1)
@@ -137,7 +136,7 @@ def curves(axis: str, rows: pd.DataFrame, *, max_columns: int = MAX_COLUMNS) -> 
         axes[1, column].set_xlabel(axis.replace("_", " "))
         axes[1, column].tick_params(labelbottom=True)
         for part in axes[:, column]:
-            part.spines[["top", "right"]].set_visible(False)
+            hide_frame(part)
     axes[0, 0].set_ylabel("LPP, in prior sd")
     axes[1, 0].set_ylabel("ACAUC (0 is calibrated)")
     _add_legend(figure, seen)
@@ -214,21 +213,13 @@ def _set_scale(axes: Any, rows: pd.DataFrame, values: pd.Series) -> None:
 
 
 def _set_ticks(axes: Any, scale: LPPAxis, low: float, high: float) -> None:
-    ticks = [scale.prior]
-    step = _round_down((high - scale.prior) / 3) if high > scale.prior else 0.0
-    if step > 0:
-        start = math.ceil(scale.prior / step) * step
-        ticks += [t for t in np.arange(start, high, step) if t - scale.prior > step / 2]
-    distance = _round_down(2 * scale.unit)
-    while scale.prior - distance > low:
-        ticks.append(round(scale.prior - distance, 3))
-        distance *= 3
+    """Put a tick at the prior, at round numbers above it, and at distances below it."""
+    prior, unit = scale.prior, scale.unit
+    above = MaxNLocator(4, steps=[1, 2, 5, 10]).tick_values(prior, high)
+    below = prior - float(f"{2 * unit:.1g}") * 3.0 ** np.arange(12)
+    ticks = [prior, *above[(above > prior + unit / 6) & (above < high)]]
+    ticks += [tick for tick in below if tick > low]
     axes.set_yticks(ticks, [f"{tick:.3g}" for tick in ticks])
-
-
-def _round_down(value: float) -> float:
-    power = 10.0 ** math.floor(math.log10(value))
-    return max(m for m in (1, 2, 5) if m * power <= value * (1 + 1e-9)) * power
 
 
 def _lines(axis: str, rows: pd.DataFrame) -> list[str]:
@@ -299,15 +290,11 @@ def _distance(cell: Cell) -> tuple[Any, ...]:
 
 def _coverage(rows: pd.DataFrame, arrays: Arrays) -> Figure:
     shown = _shown(rows, arrays, "coverage")
-    bands, columns = _grid(len(shown))
-    height = 3.4 + 4.2 * (bands - 1)
-    figure = Figure(figsize=(3.0 * columns + 1.9, height), layout="constrained")
-    axes = figure.subplots(bands, columns, squeeze=False).flatten()
-    for part in axes[len(shown) :]:
-        part.set_axis_off()
+    options = {"columns": MAX_COLUMNS, "width": 3.6, "height": 3.6}
+    figure, panels = panel_grid(len(shown), **options)
     levels = np.arange(1, 100) / 100
     seen: dict[str, Any] = {}
-    for part, (where, cells) in zip(axes, shown.items(), strict=False):
+    for part, (where, cells) in zip(panels, shown.items(), strict=True):
         part.plot([0, 1], [0, 1], color="0.6", lw=0.8)
         for name, cell in cells.items():
             colour, line, _ = _style(cell)
@@ -317,8 +304,7 @@ def _coverage(rows: pd.DataFrame, arrays: Arrays) -> Figure:
         part.set(xlim=(0, 1), ylim=(0, 1), box_aspect=1)
         part.set_title("\n".join(data_in_words(*where)))
         part.set_xlabel("credible level")
-        part.spines[["top", "right"]].set_visible(False)
-    axes[0].set_ylabel("share of true parameters inside")
+    panels[0].set_ylabel("share of true parameters inside")
     _add_legend(figure, seen)
     return figure
 
@@ -356,13 +342,10 @@ def rank_figure(ranks: pd.DataFrame) -> Figure:
     draws = np.random.default_rng(0).integers(num_tasks, size=(2000, num_tasks))
     resampled = values[:, draws]
     # A draw may have none of the tasks that a method was run on.
-    known = np.isfinite(resampled)
-    sums, counts = np.where(known, resampled, 0.0).sum(axis=2), known.sum(axis=2)
-    means = np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
-    tail = (1 - 0.95) / 2
-    low, high = np.nanquantile(means, [tail, 1 - tail], axis=1)
-    figure = Figure(figsize=(7, 0.28 * len(mean) + 1), layout="constrained")
-    axes = figure.subplots()
+    with np.errstate(invalid="ignore"):
+        means = np.nansum(resampled, axis=2) / np.isfinite(resampled).sum(axis=2)
+    low, high = np.nanquantile(means, [0.025, 0.975], axis=1)
+    figure, axes = new_figure(7, 0.28 * len(mean) + 1)
     names = []
     for height, (name, value) in enumerate(mean.items()):
         colour = METHODS[str(name)].style[0]
@@ -372,5 +355,4 @@ def rank_figure(ranks: pd.DataFrame) -> Figure:
         names.append(f"{name}" if run == num_tasks else f"{name} [{run} tasks]")
     axes.set_yticks(range(len(mean)), names)
     axes.set_xlabel(f"mean rank over {num_tasks} tasks: 0 is best, 1 last or failed")
-    axes.spines[["top", "right"]].set_visible(False)
     return figure

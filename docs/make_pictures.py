@@ -35,6 +35,7 @@ QUIET: dict[str, Any] = {"show_progress_bars": False}
 NUM_LABELLED = 50
 # The parameters that pair plots show, and the observation that they show them of.
 SHOWN, NAMES = [0, 3], ["red", "polariser angle [degree]"]
+ALL_NAMES = ["red", "green", "blue", "angle"]
 OBSERVED = 2
 
 
@@ -81,12 +82,14 @@ def overconfident(npe: Any, posterior: Any, theta_o: Tensor, x_o: Tensor) -> "Fi
     return plots.calibration_curves(found)
 
 
+def shown(posterior: Any, x: Tensor) -> Tensor:
+    """Return samples of one observation, of the parameters that are shown."""
+    return draw_samples(posterior, x, num_samples=2000)[:, 0, SHOWN]
+
+
 def one_observation(npe: Any, posterior: Any, theta: Tensor, x: Tensor) -> "Figure":
     """Draw the posteriors of a single observation."""
-    samples = {
-        name: draw_samples(one, x, num_samples=2000)[:, 0, SHOWN]
-        for name, one in {"NPE": npe, "stack": posterior}.items()
-    }
+    samples = {"NPE": shown(npe, x), "stack": shown(posterior, x)}
     prior = npe.prior.sample((2000,))[:, SHOWN]
     return plots.pair_plot(samples, theta[SHOWN], parameter_names=NAMES, prior=prior)
 
@@ -98,20 +101,16 @@ def overview(rope: RoPE, npe: Any, theta: Tensor, x_o: Tensor) -> "Figure":
         before, after = (
             net(x_o) for net in (rope.embedding_net, rope.tuned_embedding_net)
         )
-    samples = {
-        "NPE": draw_samples(npe, x_o[:1], num_samples=2000)[:, 0],
-        "RoPE": posterior[0].sample((2000,), **QUIET),
-    }
+    draws = posterior[0].sample((2000,), **QUIET)[:, SHOWN]
     return plots.overview(
         simulated=posterior.coupling.simulated,
         before=before,
         after=after,
         weights=posterior.weights[0],
-        samples=samples,
-        theta=theta,
-        parameter_names=["red", "green", "blue", "polariser angle [degree]"],
-        parameters=SHOWN,
-        prior=npe.prior.sample((2000,)),
+        samples={"NPE": shown(npe, x_o[:1]), "RoPE": draws},
+        theta=theta[SHOWN],
+        parameter_names=NAMES,
+        prior=npe.prior.sample((2000,))[:, SHOWN],
     )
 
 
@@ -122,12 +121,6 @@ def discrepancy(npe: Any, simulator: Any, theta: Tensor, x: Tensor) -> "Figure":
     report = method.append_calibration(theta, x).report(x_names=names, seed=0)
     print(report)
     return plots.discrepancy(report)
-
-
-def guaranteed_sets(posterior: Any, theta: Tensor, x: Tensor) -> "Figure":
-    """Draw the credible set of an observation, and that with a guarantee."""
-    names = ("red", "green", "blue", "angle")
-    return plots.credible_set(posterior, x, theta, parameter_names=names)
 
 
 def gammas(rope: RoPE, theta: Tensor, x_o: Tensor) -> "Figure":
@@ -144,19 +137,9 @@ def gammas(rope: RoPE, theta: Tensor, x_o: Tensor) -> "Figure":
 
 def other_prior(rope: RoPE, theta_o: Tensor, x_o: Tensor) -> "Figure":
     """Draw the parameters that a batch with much red implies."""
-    names = ("red", "green", "blue", "angle")
     bright = x_o[theta_o[:, 0] > 45]
-    diagnosis = diagnose(rope, bright, parameter_names=names, seed=0, **QUIET)
+    diagnosis = diagnose(rope, bright, parameter_names=ALL_NAMES, seed=0, **QUIET)
     return arranged(plots.implied_parameters(diagnosis), columns=2, size=(7.0, 5.0))
-
-
-def steps(rope: RoPE, x_o: Tensor) -> dict[str, "Figure"]:
-    """Draw what the first two steps of RoPE return."""
-    coupling = rope.build_posterior(x_o, seed=0, **QUIET).coupling
-    return {
-        "finetuning": plots.finetuning_history(rope.history),
-        "effective_sample_sizes": plots.effective_sample_sizes(coupling),
-    }
 
 
 def learning_curve(report: Any) -> "Figure":
@@ -221,17 +204,19 @@ def main() -> None:
     save(discrepancy(npe, simulator, theta_cal, x_cal), "discrepancy")
     save(gammas(rope, theta_o[OBSERVED], x_o), "gammas")
     save(other_prior(rope, theta_o, x_o), "other_prior")
-    for name, figure in steps(rope, x_o).items():
-        save(figure, name)
+    save(plots.finetuning_history(rope.history), "finetuning")
+    coupling = rope.build_posterior(x_o, seed=0, **QUIET).coupling
+    save(plots.effective_sample_sizes(coupling), "effective_sample_sizes")
     posterior = stack(rope, learning_curve=True, seed=0, **QUIET)
     print(posterior.report)
     save(learning_curve(posterior.report), "learning_curve")
     without = replace(posterior.report, learning_curve=None)
     save(plots.stacking_report(without), "stacking")
     save(overconfident(npe, posterior, theta_o, x_o), "overconfident")
-    pair = (theta_o[OBSERVED], x_o[OBSERVED : OBSERVED + 1])
-    save(one_observation(npe, posterior, *pair), "one_observation")
-    save(guaranteed_sets(posterior, *pair), "guaranteed_sets")
+    theta_1, x_1 = theta_o[OBSERVED], x_o[OBSERVED : OBSERVED + 1]
+    save(one_observation(npe, posterior, theta_1, x_1), "one_observation")
+    sets = plots.credible_set(posterior, x_1, theta_1, parameter_names=ALL_NAMES)
+    save(sets, "guaranteed_sets")
 
 
 if __name__ == "__main__":

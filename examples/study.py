@@ -205,6 +205,7 @@ class Study:
                 ),
                 "RoPE": posterior[0].sample((2000,), show_progress_bars=False),
             }
+        ends = sorted({0, task.theta_dim - 1})
         names = [
             name if unit == "1" else f"{name} [{unit}]"
             for name, unit in zip(
@@ -217,11 +218,10 @@ class Study:
                 before=before,
                 after=after,
                 weights=posterior.weights[0],
-                samples=samples,
-                theta=theta_o[0],
-                parameter_names=names,
-                parameters=tuple({0, task.theta_dim - 1}),
-                prior=prior,
+                samples={name: value[:, ends] for name, value in samples.items()},
+                theta=theta_o[0, ends],
+                parameter_names=[names[k] for k in ends],
+                prior=prior[:, ends],
             ),
             "posterior": plots.pair_plot(
                 samples, theta_o[0], parameter_names=names, prior=prior

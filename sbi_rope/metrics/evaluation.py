@@ -171,7 +171,7 @@ class Evaluation:
 
     @property
     def acauc(self) -> Estimate:
-        r"""The average coverage AUC: 0 if calibrated, positive if over-confident.
+        r"""The average coverage AUC, 0 if calibrated and positive if over-confident.
 
         .. math:: \text{ACAUC} = \frac{1}{d n} \sum_{j, i} \int_0^1 \alpha
             - \mathbf{1}[\theta_{ij} \in \Theta_{ij}(\alpha)] \,\mathrm{d}\alpha
@@ -363,8 +363,8 @@ class Evaluation:
     def __str__(self) -> str:
         n, d = self.ranks.shape
         lines = [
-            f"{n} observations with {d} true parameter{'s' * (d > 1)} each, means with 95% "
-            "intervals",
+            f"{n} observations with {d} true parameter{'s' * (d > 1)} each, means with "
+            "95% intervals",
             f"  LPP, the log density of the true parameters: {self.lpp:.2f} nats",
         ]
         if not math.isnan(self.lpp_z.mean):

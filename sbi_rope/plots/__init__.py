@@ -7,16 +7,15 @@ when a function is called. Install it with ``pip install sbi-rope[benchmarks]``.
 from sbi_rope.plots.diagnosis import implied_parameters
 from sbi_rope.plots.diagnostics import (
     calibration_curves,
+    discrepancy,
     effective_sample_sizes,
     finetuning_history,
     ranks_by_estimate,
+    real_and_simulated,
 )
-from sbi_rope.plots.observations import real_and_simulated
-from sbi_rope.plots.posteriors import pair_plot
+from sbi_rope.plots.posteriors import overview, pair_plot
 from sbi_rope.plots.sets import credible_set
 from sbi_rope.plots.stacking import stacking_report
-from sbi_rope.plots.steps import overview
-from sbi_rope.plots.summaries import discrepancy
 
 __all__ = [
     "calibration_curves",

@@ -1,6 +1,7 @@
 """Empty figures, and the colours and line styles that all plots share."""
 
 from collections.abc import Iterable
+from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -21,9 +22,7 @@ METHOD_STYLES = {"RoPE": (BLUE, "-"), "NPE": (VERMILLION, "--")}
 
 def new_figure(width: float, height: float) -> "tuple[Figure, Axes]":
     """Return a figure with one panel. It has no window and need not be closed."""
-    figure = empty_figure(width, height)
-    axes = figure.subplots()
-    hide_frame(axes)
+    figure, (axes,) = panel_grid(1, columns=1, width=width, height=height)
     return figure, axes
 
 
@@ -34,23 +33,32 @@ def empty_figure(width: float, height: float) -> "Figure":
     return Figure(figsize=(width, height), layout="constrained")
 
 
+def panel_grid(
+    count: int, *, columns: int, width: float, height: float, **options: Any
+) -> "tuple[Figure, list[Axes]]":
+    """Return a figure with panels of a size, in at most as many columns."""
+    rows, columns = -(-count // columns), min(count, columns)
+    figure = empty_figure(width * columns, height * rows)
+    panels = list(figure.subplots(rows, columns, squeeze=False, **options).flat)
+    for axes in panels[count:]:
+        axes.remove()
+    for axes in panels[:count]:
+        hide_frame(axes)
+    return figure, panels[:count]
+
+
 def hide_frame(axes: "Axes") -> None:
     """Hide the upper and the right edge of a panel."""
     axes.spines[["top", "right"]].set_visible(False)
 
 
 def draw_calibrated_band(
-    axes: "Axes", num_observations: int, *, label: str | None = None
+    axes: "Axes", num_observations: float, *, label: str | None = None
 ) -> None:
-    r"""Draw the diagonal and the band around it that holds calibrated posteriors.
-
-    At each level :math:`\alpha` the band holds 95 % of the coverage curves of one
-    parameter, :math:`\alpha \pm 1.96 \sqrt{\alpha (1 - \alpha) / n}`.
-    """
+    """Draw the diagonal, and the band of ``calibration_curves`` around it."""
     alpha = torch.linspace(0.0, 1.0, 201)
     width = 1.96 * (alpha * (1.0 - alpha) / num_observations).sqrt()
-    low, high = (alpha - width).clamp(min=0.0), (alpha + width).clamp(max=1.0)
-    axes.fill_between(alpha, low, high, color="0.85", label=label)
+    axes.fill_between(alpha, alpha - width, alpha + width, color="0.85", label=label)
     axes.plot([0, 1], [0, 1], color=GREY, lw=0.8)
     axes.set(xlim=(0, 1), ylim=(0, 1), box_aspect=1)
 
@@ -66,19 +74,11 @@ def add_legend_above(figure: "Figure", axes: "Axes") -> None:
 def line_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
     """Return a line style for each method; different methods look different."""
     names = list(names)
-    known = {name: METHOD_STYLES[name] for name in names if name in METHOD_STYLES}
-    colours = _without(COLOURS, [colour for colour, _ in known.values()])
-    lines = _without(LINE_STYLES, [line for _, line in known.values()])
-    others = [name for name in names if name not in known]
-    pairs = known | {
-        name: (colours[i % len(colours)], lines[i % len(lines)])
-        for i, name in enumerate(others)
-    }
-    return {
-        name: {"color": pairs[name][0], "linestyle": pairs[name][1], "linewidth": 1.8}
-        for name in names
-    }
-
-
-def _without(values: list[str], taken: list[str]) -> list[str]:
-    return [value for value in values if value not in taken]
+    taken = {part for name in names for part in METHOD_STYLES.get(name, ())}
+    colours = cycle([colour for colour in COLOURS if colour not in taken])
+    lines = cycle([line for line in LINE_STYLES if line not in taken])
+    styles = {}
+    for name in names:
+        colour, line = METHOD_STYLES.get(name) or (next(colours), next(lines))
+        styles[name] = {"color": colour, "linestyle": line, "linewidth": 1.8}
+    return styles

@@ -1,12 +1,14 @@
-"""Pictures of calibration, losses of a fine-tuning, and sizes of couplings."""
+"""Pictures of discrepancies, calibration, fine-tuning and couplings."""
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
+from torch import Tensor
 
 from sbi_rope.coupling import Coupling
+from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.finetuning import History
 from sbi_rope.metrics import Evaluation
 from sbi_rope.metrics.evaluation import LEVEL, NOMINAL
@@ -15,38 +17,121 @@ from sbi_rope.plots._figures import (
     GREY,
     SKY,
     VERMILLION,
+    add_legend_above,
     draw_calibrated_band,
     empty_figure,
     hide_frame,
     line_styles,
     new_figure,
+    panel_grid,
 )
-from sbi_rope.settings import check, names_of
+from sbi_rope.plots._samples import as_drawn, central_interval
+from sbi_rope.settings import names_of
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "calibration_curves",
-    "effective_sample_sizes",
-    "finetuning_history",
-    "ranks_by_estimate",
-]
+# The most parameters, series and summaries that are drawn.
+MAX_PANELS, MAX_SUMMARIES = 6, 20
 
-# The most parameters that are drawn, each in a panel.
-MAX_PANELS = 6
+
+def real_and_simulated(
+    x_o: Tensor, x_s: Tensor, *, x_names: Sequence[str] | None = None
+) -> "Figure":
+    """Draw real observations in blue, and simulations with the same parameters.
+
+    Args:
+        x_o: Real observations, shape ``(n, l)``.
+        x_s: Simulations with the parameters of the real observations, same shape.
+        x_names: A name for each of the l entries, of which a histogram of their central
+            99 % is drawn. If None, the first six observations are drawn as series.
+
+    Returns:
+        The figure.
+    """
+    x_o = as_drawn("x_o", x_o, np.shape(x_o)[-1:])
+    x_s = as_drawn("x_s", x_s, x_o.shape[1:], rows=len(x_o))
+    if x_names is None:
+        count = min(len(x_o), MAX_PANELS)
+        figure, panels = panel_grid(count, columns=3, width=3.2, height=2.2)
+        for axes, real, simulated in zip(panels, x_o, x_s, strict=False):
+            axes.plot(simulated, color=VERMILLION, lw=1.2, label="simulated")
+            axes.plot(real, color=BLUE, lw=1.2, label="real")
+    else:
+        figure, panels = panel_grid(len(x_names), columns=4, width=2.6, height=2.4)
+        ends = central_interval(torch.cat([x_o, x_s])).T.tolist()
+        style = {"bins": 40, "density": True, "histtype": "stepfilled", "alpha": 0.45}
+        for k, (axes, name) in enumerate(zip(panels, x_names, strict=True)):
+            style["range"] = ends[k]
+            axes.hist(x_s[:, k], color=VERMILLION, label="simulated", **style)
+            axes.hist(x_o[:, k], color=BLUE, label="real", **style)
+            axes.set(xlabel=name, yticks=[])
+    add_legend_above(figure, panels[0])
+    return figure
+
+
+def discrepancy(report: DiscrepancyReport) -> "Figure":
+    r"""Draw how each summary of real observations differs from simulated ones.
+
+    .. math:: x_o = \bar x + \text{shift} + \text{gain}\,(x_s - \bar x) + \text{error}
+
+    There is a row with 95 % intervals for each of the first twenty summaries of the
+    report, sorted by size. Summaries without a sign of a discrepancy come last and are
+    grey. The first panel shows the size of the discrepancy, with the error included.
+    The second shows the shift, which is zero without a discrepancy. All rows have one
+    scale, the standard deviations of simulations, and the numbers in units of x are
+    written beside them. The third shows the gain, which is one without a discrepancy.
+
+    Args:
+        report: What ``DiscrepancyNPE.report()`` returns.
+
+    Returns:
+        The figure.
+    """
+    shown = report.summaries[:MAX_SUMMARIES]
+    figure = empty_figure(8.6, 1.5 + 0.3 * len(shown))
+    size, shift, gain = figure.subplots(1, 3, width_ratios=[1.0, 1.1, 0.8], sharey=True)
+    labels = {
+        True: "a discrepancy is more probable than none",
+        False: "no sign of a discrepancy",
+    }
+    for k, one in enumerate(shown):
+        colour, label = BLUE if one.is_off else "0.65", labels.pop(one.is_off, None)
+        style = {"color": colour, "lw": 1.8, "marker": "o", "ms": 5, "label": label}
+        for axes, found in ((size, one.size), (shift, one.shift), (gain, one.gain)):
+            unit = one.std if axes is shift else 1.0
+            ends = [end / unit for end in (found.low, found.median, found.high)]
+            axes.plot(ends, [k, k, k], **style, markevery=[1])
+        beside, colour = shift.get_yaxis_transform(), "black" if one.is_off else GREY
+        text = {"transform": beside, "color": colour, "va": "center"}
+        shift.text(1.04, k, str(one.shift), **text)
+    for axes, neutral in ((size, 0.0), (shift, 0.0), (gain, 1.0)):
+        hide_frame(axes)
+        axes.axvline(neutral, color=GREY, lw=0.8, zorder=0)
+    for axes in (shift, gain):
+        axes.tick_params(axis="y", length=0)
+        axes.spines["left"].set_visible(False)
+    size.set_yticks(range(len(shown)), [summary.name for summary in shown])
+    size.set(xlim=(0.0, None), ylim=(len(shown) - 0.4, -0.6))
+    size.set_xlabel("size, in sd\nof simulations")
+    shift.set_xlabel("shift, in sd of simulations\n(beside it, in units of x)")
+    gain.set_xlabel("gain")
+    add_legend_above(figure, size)
+    note = f"{report.num_pairs} calibration pairs, 95 % intervals, sorted by size"
+    if left_out := len(report.summaries) - len(shown):
+        note += f"; {left_out} summaries that are less off not shown"
+    figure.supxlabel(note, fontsize="medium", color=GREY)
+    return figure
 
 
 def calibration_curves(evaluations: Mapping[str, Evaluation]) -> "Figure":
     r"""Draw the coverage of central credible intervals against their level.
 
     A posterior is under-confident where its curve is above the diagonal, and
-    over-confident where it is below. At each level the band holds 95 % of the curves of
-    calibrated posteriors of one parameter. For the average of several parameters it is
-    wide enough, too. It is drawn for the smallest test set, whose size is :math:`n`:
-
-    .. math:: \alpha \pm 1.96 \sqrt{\alpha (1 - \alpha) / n}
+    over-confident where it is below. At each level the band :math:`\alpha \pm 1.96
+    \sqrt{\alpha (1 - \alpha) / n}` holds 95 % of the curves of calibrated posteriors of
+    one parameter. For the average of several parameters it is wide enough, too. It is
+    drawn for the smallest test set, whose size is :math:`n`.
 
     Args:
         evaluations: The scores of each method, by name. Averages over parameters are
@@ -55,18 +140,13 @@ def calibration_curves(evaluations: Mapping[str, Evaluation]) -> "Figure":
     Returns:
         The figure.
     """
-    for name, one in evaluations.items():
-        check(f"evaluations[{name!r}]", one, Evaluation)
     figure, axes = new_figure(7.4, 4.2)
     count = round(min(one.num_independent for one in evaluations.values()))
-    label = f"calibrated, 95 % (n = {count})"
-    draw_calibrated_band(axes, count, label=label)
-    styles = line_styles(evaluations)
-    for name, one in evaluations.items():
-        curve = one.coverage.nanmean(dim=1).cpu()
-        axes.plot(NOMINAL, curve, label=name, **styles[name])
-    axes.set_xlabel("credible level")
-    axes.set_ylabel("share of true parameters inside")
+    draw_calibrated_band(axes, count, label=f"calibrated, 95 % (n = {count})")
+    for name, style in line_styles(evaluations).items():
+        curve = evaluations[name].coverage.nanmean(dim=1).cpu()
+        axes.plot(NOMINAL, curve, label=name, **style)
+    axes.set(xlabel="credible level", ylabel="share of true parameters inside")
     note = {"color": GREY, "size": "small", "transform": axes.transAxes}
     axes.text(0.03, 0.97, "under-confident", va="top", **note)
     axes.text(0.97, 0.03, "over-confident", ha="right", **note)
@@ -94,48 +174,27 @@ def ranks_by_estimate(
     Returns:
         The figure.
     """
-    check("evaluation", evaluation, Evaluation)
-    names, count = evaluation.names, len(evaluation.names)
-    if parameter_names is not None:
-        names = names_of(parameter_names, count)
-    shown = min(count, MAX_PANELS)
-    columns = min(shown, 3)
-    rows = math.ceil(shown / columns)
-    figure = empty_figure(max(3.2 * columns, 4.2), 2.8 * rows)
-    panels = figure.subplots(rows, columns, sharey=True, squeeze=False).flat
-    for k, (axes, name) in enumerate(zip(panels, names[:shown], strict=False)):
-        _draw_ranks(axes, evaluation, k)
-        axes.set_xlabel(f"estimate of {name}")
-        if k % columns == 0:
+    names = parameter_names or evaluation.names
+    names = names_of(names, len(evaluation.names))[:MAX_PANELS]
+    estimates, ranks = evaluation.estimates.cpu(), evaluation.ranks.cpu()
+    found, tail, count = evaluation.dependence, (1 - LEVEL) / 2, len(names)
+    figure, panels = panel_grid(count, columns=3, width=3.2, height=2.8, sharey=True)
+    for k, (axes, name) in enumerate(zip(panels, names, strict=True)):
+        axes.axhspan(0.0, tail, color="0.88", lw=0)
+        axes.axhspan(1 - tail, 1.0, color="0.88", lw=0)
+        axes.plot(estimates[:, k], ranks[:, k], "o", color=BLUE, ms=3.5)
+        left, right = axes.get_xlim()
+        axes.set(xlim=(left, right), ylim=(0, 1), xlabel=f"estimate of {name}")
+        if k % 3 == 0:
             axes.set_ylabel("rank of the true parameter")
-    for axes in figure.axes[shown:]:
-        axes.set_axis_off()
+        low, high = found.edges[k].tolist()
+        if low != low:  # NaN, as the parameter is not known anywhere
+            continue
+        axes.vlines([low, high], 0, 1, color=GREY, lw=0.8)
+        centres = ((left + low) / 2, (low + high) / 2, (high + right) / 2)
+        for x, share in zip(centres, found.shares[k].tolist(), strict=True):
+            axes.text(x, 1.03, f"{share:.0%}", ha="center", size=9)
     return figure
-
-
-def _draw_ranks(axes: "Axes", evaluation: Evaluation, k: int) -> None:
-    found, tail = evaluation.dependence, (1 - LEVEL) / 2
-    for low, high in ((0.0, tail), (1 - tail, 1.0)):
-        axes.axhspan(low, high, color="0.88", lw=0)
-    axes.plot(
-        evaluation.estimates[:, k].cpu(),
-        evaluation.ranks[:, k].cpu(),
-        "o",
-        color=BLUE,
-        ms=3.5,
-    )
-    left, right = axes.get_xlim()
-    edges = [edge for edge in found.edges[k].tolist() if not math.isnan(edge)]
-    for edge in edges:
-        axes.axvline(edge, color=GREY, lw=0.8)
-    if edges:
-        ends = [left, *edges, right]
-        for share, start, stop in zip(
-            found.shares[k].tolist(), ends, ends[1:], strict=False
-        ):
-            axes.text((start + stop) / 2, 1.03, f"{share:.0%}", ha="center", size=9)
-    axes.set(xlim=(left, right), ylim=(0, 1))
-    hide_frame(axes)
 
 
 def finetuning_history(history: History) -> "Figure":
@@ -148,32 +207,18 @@ def finetuning_history(history: History) -> "Figure":
     Returns:
         The figure.
     """
-    check("history", history, History)
-    training, validation = history.training_loss, history.validation_loss
     figure, axes = new_figure(6.0, 3.6)
-    from matplotlib.ticker import MaxNLocator
-
-    axes.plot(training, label="training pairs", color=BLUE, lw=1.2)
-    kept = training
-    if validation:
-        axes.plot(validation, label="held-out pairs", color=VERMILLION, lw=1.2)
-        kept = validation
+    loss = history.training_loss
+    axes.plot(loss, label="training pairs", color=BLUE, lw=1.2)
+    if history.validation_loss:
+        loss = history.validation_loss
+        axes.plot(loss, label="held-out pairs", color=VERMILLION, lw=1.2)
     step = history.best_epoch
-    suffix = " (the starting point)" if step == 0 else ""
+    kept = f"kept: step {step}{'' if step else ' (the starting point)'}"
     axes.axvline(step, color=GREY, lw=0.8)
-    axes.plot(
-        [step],
-        [kept[step]],
-        "o",
-        color="black",
-        ms=5,
-        clip_on=False,
-        label=f"kept: step {step}{suffix}",
-    )
-    axes.set_xlim(left=0, right=max(len(training) - 1, 1))
-    axes.set_ylim(bottom=0)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set_xlabel("step")
+    axes.plot(step, loss[step], "o", color="black", ms=5, clip_on=False, label=kept)
+    axes.set(xlim=(0, max(len(loss) - 1, 1)), ylim=(0, None), xlabel="step")
+    axes.locator_params("x", integer=True)
     axes.set_ylabel("mean distance to the target\n(units of the embedding)")
     axes.legend(frameon=False)
     return figure
@@ -193,23 +238,15 @@ def effective_sample_sizes(coupling: Coupling) -> "Figure":
     Returns:
         The figure, a histogram on a logarithmic axis.
     """
-    check("coupling", coupling, Coupling)
     sizes = coupling.effective_sample_size.detach().cpu().double()
+    n_s, median = len(coupling.simulated), float(sizes.median())
     figure, axes = new_figure(6.0, 3.6)
-    num_simulations = len(coupling.simulated)
-    edges = torch.logspace(0, math.log10(max(num_simulations, 2)), 41).tolist()
-    median = float(sizes.median())
+    edges = np.geomspace(1, max(n_s, 2), 41).tolist()
     axes.hist(sizes.clamp(edges[0], edges[-1]), bins=edges, color=SKY)
     axes.axvline(median, color=BLUE, lw=1.8, label=f"median: {median:.3g} simulations")
-    axes.axvline(
-        num_simulations,
-        color="black",
-        ls="--",
-        lw=1.2,
-        label=f"all equal: $n_s$ = {num_simulations}",
-    )
-    axes.set_xscale("log")
-    axes.set_xlabel("effective sample size (simulations)")
+    label = f"all equal: $n_s$ = {n_s}"
+    axes.axvline(n_s, color="black", ls="--", lw=1.2, label=label)
+    axes.set(xscale="log", xlabel="effective sample size (simulations)")
     axes.set_ylabel(f"observations (of {len(sizes)})")
     axes.legend(frameon=False, loc="upper left")
     return figure

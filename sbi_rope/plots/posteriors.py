@@ -1,11 +1,13 @@
-"""Several posteriors of one observation in one picture."""
+"""Posteriors of one observation, and how RoPE makes one."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import torch
 from torch import Tensor
 
-from sbi_rope.plots._figures import PRIOR, empty_figure, line_styles
+from sbi_rope.plots._figures import BLUE, VERMILLION, empty_figure, hide_frame
 from sbi_rope.plots._samples import (
     as_drawn,
     as_samples,
@@ -13,18 +15,23 @@ from sbi_rope.plots._samples import (
     corner_legend,
     corner_panels,
     draw_contours,
-    draw_edges,
-    draw_marginal,
-    edges_crossed,
-    label_with_share,
-    robust_limits,
-    shade_prior,
+    draw_posteriors,
+    limits_of,
+    set_up_panel,
+    styled,
+    with_margin,
 )
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["pair_plot"]
+DOTS: dict[str, Any] = {"lw": 0, "rasterized": True}
+STAR: dict[str, Any] = {"marker": "*", "ms": 15, "mec": "white", "color": "black"}
+ARROW = {"arrowstyle": "-|>", "color": "black", "lw": 1.6}
+# The most simulations and observations that are drawn. More would run together.
+MAX_SIMULATED, MAX_REAL = 1000, 250
+TITLE: dict[str, Any] = {"loc": "left", "fontsize": 11}
 
 
 def pair_plot(
@@ -37,49 +44,141 @@ def pair_plot(
     """Draw the marginals and pairs of several posteriors of one observation.
 
     Contours enclose 50 % and 90 % of the samples. The axes hold the true parameter and
-    the central 99 % of every posterior, so that a few extreme samples do not squeeze
-    the picture. A posterior that is far from the prior may lie outside the axes, and so
-    may one that is far from the truth while another posterior has the truth inside. The
-    legend then says which share of its samples is outside.
+    the central 99 % of every posterior, but reach beyond the prior by at most its
+    width. The legend says which share of a posterior is outside.
 
     Args:
         samples: Posterior samples by method name, each of shape ``(num_samples, d)``.
         theta: The true parameter, shape ``(d,)``, which is marked in black.
         parameter_names: A label for each parameter, with its unit.
         prior: Samples of the prior, shape ``(n, d)``. Their central 99 % is shaded.
-            Where posterior samples are beyond all of them, a dotted line marks the end.
 
     Returns:
         The figure, with d rows and columns and the marginals on the diagonal.
     """
     draws, truth, names = as_samples(samples, theta, parameter_names)
-    dim = len(names)
-    figure = empty_figure(2.0 * dim + 0.8, 2.0 * dim + 1.0)
-    interval = edges = None
-    if prior is not None:
-        prior = as_drawn("prior", prior, (dim,))
-        interval = central_interval(prior)
-        edges = edges_crossed(prior, list(draws.values()))
-    limits = robust_limits(list(draws.values()), truth, interval)
-    styles = line_styles(draws)
-    for axes, pair in corner_panels(figure, names, limits, truth):
-        if interval is not None:
-            shade_prior(axes, interval[:, pair])
-        for name, style in styles.items():
-            if len(pair) == 1:
-                draw_marginal(axes, draws[name][:, pair[0]], style)
-            else:
-                draw_contours(axes, draws[name][:, pair], style)
-        if edges is not None:
-            draw_edges(axes, edges[:, pair])
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
-    handles: list[Any] = [
-        Line2D([], [], label=label_with_share(name, value, limits), **styles[name])
-        for name, value in draws.items()
-    ]
-    if interval is not None:
-        handles.append(Patch(color=PRIOR, label="prior"))
-    corner_legend(figure, handles, truth)
+    interval = _interval(prior, len(names))
+    limits = limits_of(draws.values(), truth, interval)
+    figure = empty_figure(2.0 * len(names) + 0.8, 2.0 * len(names) + 1.0)
+    posteriors = styled(draws, limits)
+    for axes, shown in corner_panels(figure, names, limits, truth):
+        draw_posteriors(axes, posteriors, interval, shown)
+    corner_legend(figure, figure.axes[0].get_legend_handles_labels()[0], None)
     return figure
+
+
+def overview(
+    *,
+    simulated: Tensor,
+    before: Tensor,
+    after: Tensor,
+    weights: Tensor,
+    samples: Mapping[str, Tensor],
+    theta: Tensor,
+    parameter_names: Sequence[str],
+    prior: Tensor | None = None,
+) -> "Figure":
+    r"""Draw what RoPE does for one observation: tune, couple, mix.
+
+    1. *Tune* shows the embeddings of real observations before and after tuning, in the
+       plane of the first two principal components of the simulations' embeddings.
+       Contours enclose 90 % of the observations. The arrow shows how far the first one
+       moves.
+    2. *Couple* shows the simulations in the same plane. The larger and darker a
+       simulation is, the larger is its weight in the posterior of the first
+       observation, which is the star.
+    3. *Mix* shows the posterior of that observation, as in :func:`pair_plot`.
+
+    Args:
+        simulated: Embeddings of simulations :math:`h(x_s)`, shape ``(n_s, l)``:
+            ``posterior.coupling.simulated``.
+        before: Embeddings :math:`h(x_o)` before tuning, shape ``(n_o, l)``.
+        after: Embeddings :math:`g(x_o)` after tuning, shape ``(n_o, l)``.
+        weights: The weights of the simulations for the first observation, shape
+            ``(n_s,)``: ``posterior.weights[0]``.
+        samples: Samples of its posterior by method name, each of shape
+            ``(num_samples, d)``. The first two parameters are shown.
+        theta: Its true parameter, shape ``(d,)``.
+        parameter_names: As in :func:`pair_plot`.
+        prior: As in :func:`pair_plot`.
+
+    Returns:
+        The figure, with three panels.
+    """
+    width = np.shape(simulated)[-1:]
+    simulated, before, after = _in_plane(
+        as_drawn("simulated", simulated, width),
+        as_drawn("before", before, width),
+        as_drawn("after", after, width),
+    )
+    weights = as_drawn("weights", weights, (), rows=len(simulated))
+    draws, truth, names = as_samples(samples, theta, parameter_names)
+    interval = _interval(prior, len(names))
+    limits = limits_of(draws.values(), truth, interval)
+    figure = empty_figure(9.6, 3.9)
+    tune, couple, mix = figure.subplots(1, 3)
+
+    _draw_simulations(tune, simulated, before, after)
+    tune.collections[0].set_label("simulations")
+    tune.set_ylabel("2nd principal component" if width != (1,) else "")
+    for points, colour, line, label in (
+        (before, VERMILLION, "--", "real, before tuning"),
+        (after, BLUE, "-", "real, after tuning"),
+    ):
+        style = {"color": colour, "linestyle": line}
+        draw_contours(tune, points, style, shares=[0.9])
+        style = {"s": 9, "color": colour, "alpha": 0.7, "label": label}
+        tune.scatter(*points[:MAX_REAL].T, **style, **DOTS)
+    tune.plot(*after[0].tolist(), **STAR, zorder=6)
+    ends = after[0].tolist(), before[0].tolist()
+    tune.annotate("", *ends, arrowprops=ARROW, zorder=7)
+
+    _draw_simulations(couple, simulated, after[:1])
+    couple.plot(*after[0].tolist(), **STAR, ls="", zorder=6, label="a real observation")
+    heaviest = weights.argsort(descending=True)[:MAX_SIMULATED]
+    size = weights[heaviest] / weights.max()
+    style = {"s": 90 * size, "alpha": 0.1 + 0.7 * size, "color": BLUE, "zorder": 3}
+    couple.scatter(*simulated[heaviest].T, **style, **DOTS)
+    count = float(weights.sum() ** 2 / weights.square().sum())
+    label = f"its {count:.0f} or so simulations"
+    couple.plot([], [], "o", color=BLUE, mew=0, label=label)
+
+    shown = list(range(len(names)))[:2]
+    set_up_panel(mix, names, limits, truth, shown)
+    draw_posteriors(mix, styled(draws, limits), interval, shown)
+    # The legends are below the panels, because points can be in any corner inside.
+    style = {"frameon": False, "loc": "upper center"}
+    tune.legend(**style, bbox_to_anchor=(0.5, -0.08), markerscale=2)
+    couple.legend(**style, bbox_to_anchor=(0.5, -0.08))
+    mix.legend(**style, bbox_to_anchor=(0.5, -0.16), ncols=2)
+    tune.set_title("1.  Tune: real data move\n     onto simulations", **TITLE)
+    couple.set_title("2.  Couple: weigh simulations\n     for each", **TITLE)
+    mix.set_title("3.  Mix: average\n     their posteriors", **TITLE)
+    return figure
+
+
+def _interval(prior: Tensor | None, dim: int) -> Tensor | None:
+    return None if prior is None else central_interval(as_drawn("prior", prior, (dim,)))
+
+
+def _in_plane(simulated: Tensor, *others: Tensor) -> list[Tensor]:
+    """Project embeddings to the two directions in which simulations vary most."""
+    # A few extreme embeddings must not turn the plane.
+    core = simulated.clamp(*central_interval(simulated))
+    centre = core.mean(dim=0)
+    basis = torch.linalg.svd(core - centre, full_matrices=False).Vh[:2].T
+    clouds = [(points - centre) @ basis for points in (simulated, *others)]
+    if basis.shape[1] == 2:
+        return clouds
+    # In one dimension, dots are spread out along the other axis.
+    heights = [torch.arange(len(points))[:, None] * 0.618 % 1 for points in clouds]
+    return [torch.cat(pair, dim=1) for pair in zip(clouds, heights, strict=True)]
+
+
+def _draw_simulations(axes: "Axes", simulated: Tensor, *others: Tensor) -> None:
+    """Draw simulations in a panel that holds the central 99 % of all points."""
+    hide_frame(axes)
+    spans = torch.cat([central_interval(points) for points in (simulated, *others)])
+    x, y = with_margin(spans.amin(dim=0), spans.amax(dim=0)).T.tolist()
+    axes.set(xlim=x, ylim=y, xticks=[], yticks=[], xlabel="1st principal component")
+    axes.scatter(*simulated[:MAX_SIMULATED].T, s=9, color="0.72", **DOTS)
