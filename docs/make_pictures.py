@@ -82,6 +82,34 @@ def overconfident(npe: Any, posterior: Any, theta_o: Tensor, x_o: Tensor) -> "Fi
     return plots.calibration_curves(found)
 
 
+def intervals(npe: Any, posterior: Any, theta: Tensor, x: Tensor) -> "Figure":
+    """Draw intervals of the first parameter of sixty test measurements."""
+    figure = plt.figure(figsize=(8, 3.6), layout="constrained")
+    panels = figure.subplots(1, 2, sharex=True, sharey=True)
+    rows = torch.randperm(len(theta), generator=torch.Generator().manual_seed(0))[:60]
+    for axes, (name, one) in zip(
+        panels, {"NPE": npe, "stack": posterior}.items(), strict=True
+    ):
+        samples = draw_samples(one, x, num_samples=1000)[..., 0]
+        low, middle, high = samples.quantile(torch.tensor([0.05, 0.5, 0.95]), dim=0)
+        truth = theta[:, 0]
+        inside = (low <= truth) & (truth <= high)
+        for rows_of, color in (
+            (rows[inside[rows]], "#0072B2"),
+            (rows[~inside[rows]], "#D55E00"),
+        ):
+            ends = torch.stack([middle - low, high - middle])[:, rows_of]
+            axes.errorbar(
+                truth[rows_of], middle[rows_of], ends, fmt="o", ms=3, lw=1, color=color
+            )
+        axes.axline((0, 0), slope=1, color="0.4", lw=0.8, zorder=0)
+        share = f"{inside.double().mean():.0%} of 90% intervals hold the truth"
+        axes.set(title=f"{name}: {share}", xlabel="true brightness of red")
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylabel("inferred, with 90% interval")
+    return figure
+
+
 def shown(posterior: Any, x: Tensor) -> Tensor:
     """Return samples of one observation, of the parameters that are shown."""
     return draw_samples(posterior, x, num_samples=2000)[:, 0, SHOWN]
@@ -213,6 +241,7 @@ def main() -> None:
     without = replace(posterior.report, learning_curve=None)
     save(plots.stacking_report(without), "stacking")
     save(overconfident(npe, posterior, theta_o, x_o), "overconfident")
+    save(intervals(npe, posterior, theta_o, x_o), "intervals")
     theta_1, x_1 = theta_o[OBSERVED], x_o[OBSERVED : OBSERVED + 1]
     save(one_observation(npe, posterior, theta_1, x_1), "one_observation")
     sets = plots.credible_set(posterior, x_1, theta_1, parameter_names=ALL_NAMES)
