@@ -51,7 +51,7 @@ ROOMS = (
 # Dataclasses of these rooms are results. Others call what they hold, or run programs.
 RESULTS = (
     *("sbi_rope._statistics.", "sbi_rope.baselines.", "sbi_rope.coupling."),
-    "sbi_rope.data.Counts",
+    *("sbi_rope.data.Counts", "sbi_rope.sets.SetScores"),
     *("sbi_rope.discrepancy.", "sbi_rope.metrics.", "sbi_rope.stacking."),
     "sbi_rope.tasks.hemodynamics.prior_table.",
 )

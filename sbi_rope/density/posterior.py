@@ -31,7 +31,7 @@ from sbi_rope.density.base import (
 from sbi_rope.density.coupled import Coupled
 from sbi_rope.errors import InvalidInputError, SamplingError
 from sbi_rope.saving import save
-from sbi_rope.sets.makes_sets import MakesSets
+from sbi_rope.sets import MakesSets
 from sbi_rope.settings import Count, Positive, check
 from sbi_rope.tensors import as_batch, as_numbers, rows_with
 
@@ -83,6 +83,9 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
     """
 
     prior: PriorDistribution
+    # One name for each parameter, and for each column of tables of x, if they have any.
+    parameter_names: tuple[str, ...] | None = None
+    x_names: tuple[str, ...] | None = None
     # Whether an amortised posterior warns of entries that are far from simulations.
     warns = True
     # The observations that the mass was last estimated for, and this mass.

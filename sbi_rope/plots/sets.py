@@ -1,6 +1,6 @@
 """A credible set of one observation, and the set with a guarantee."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -17,20 +17,14 @@ from sbi_rope.plots._samples import (
     draw_marginal,
     with_margin,
 )
-from sbi_rope.sets import CredibleIntervals
-from sbi_rope.settings import check
 from sbi_rope.stacking import StackedPosterior
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["credible_set"]
-
-NUM_SAMPLES = 2000
-CREDIBLE, GUARANTEED = "of the posterior", "guaranteed"
 STYLES: dict[str, dict[str, Any]] = {
-    CREDIBLE: {"color": BLUE, "linestyle": "-"},
-    GUARANTEED: {"color": ORANGE, "linestyle": "--"},
+    "of the posterior": {"color": BLUE, "ls": "-", "marker": "o", "ms": 4},
+    "guaranteed": {"color": ORANGE, "ls": "--", "marker": "o", "ms": 4},
 }
 
 
@@ -44,99 +38,54 @@ def credible_set(
 ) -> "Figure":
     """Draw the credible set of an observation, and of a stack that with a guarantee.
 
-    The panels of pairs show parameters that are in the sets. The larger set is drawn
-    first, so that the smaller one lies on it. With three parameters or more, a panel
-    shows the shadow of a set, in which the other parameters have any value of the set.
-    The diagonal shows the intervals of each parameter by itself, and draws of the
-    posterior as a histogram. Of a stack that cannot guarantee the level, because it has
-    too few pairs or their labels are not exact, the credible set alone is drawn, with a
-    warning.
+    The panels of pairs show parameters that are in the sets, the smaller set on the
+    larger one. With three parameters or more, a panel shows the shadow of a set. The
+    diagonal shows the intervals of each parameter, and draws of the posterior as a
+    histogram. A set that a stack cannot guarantee is left out, with a warning.
 
     Args:
         posterior: A posterior of this package.
-        x: An observation, from the batch if there is one; the default x if None.
+        x: An observation; the default x if None.
         theta: The true parameter, shape ``(d,)``, which is marked in black.
         level: The level of the sets and intervals.
-        parameter_names: A label for each parameter, with its unit. If None, the names
-            that ``RoPE`` was given.
-
-    Returns:
-        The figure, with d rows and columns and the intervals on the diagonal.
+        parameter_names: A label for each parameter; those of ``RoPE`` if None.
     """
-    check("posterior", posterior, MixturePosterior)
-    options: dict[str, Any] = {"num_samples": NUM_SAMPLES, "seed": 0}
-    sets = {CREDIBLE: posterior.credible_set(level, x, **options)}
-    intervals = {CREDIBLE: posterior.credible_intervals(level, x, **options)}
-    if isinstance(posterior, StackedPosterior):
-        options["guaranteed"] = True
+    x = posterior._one_x(x)[0]
+    found = {}
+    for name in list(STYLES)[: 1 + isinstance(posterior, StackedPosterior)]:
+        options: dict[str, Any] = {"guaranteed": bool(found), "num_samples": 2000}
+        makers = posterior.credible_set, posterior.credible_intervals
         try:
-            sets[GUARANTEED] = posterior.credible_set(level, x, **options)
-            intervals[GUARANTEED] = posterior.credible_intervals(level, x, **options)
-        except InvalidInputError as error:  # the same arguments were good before
+            found[name] = [make(level, x, seed=0, **options) for make in makers]
+        except InvalidInputError as error:
+            if not found:
+                raise
             warn_user(f"No set with a guarantee is drawn. {error}")
-    points = torch.cat([found.draws for found in sets.values()])
-    # In the order in which they are drawn, the largest first.
-    members = {
-        name: points[found.contains(points)]
-        for name, found in sorted(sets.items(), key=lambda item: -item[1].volume)
-    }
-    draws, truth, labels = as_samples(
-        {"posterior": sets[CREDIBLE].draws, **members},
-        theta,
-        posterior.parameter_names if parameter_names is None else parameter_names,
-    )
-    return _drawn(draws, intervals, truth, labels, level=level)
-
-
-def _drawn(
-    draws: dict[str, Tensor],
-    intervals: Mapping[str, CredibleIntervals],
-    truth: Tensor | None,
-    labels: Sequence[str],
-    *,
-    level: float,
-) -> "Figure":
-    dim = len(labels)
-    limits = _limits(draws, intervals, truth)
-    samples = draws.pop("posterior")
-    figure = empty_figure(2.0 * dim + 0.8, 2.0 * dim + 1.0)
+    points = torch.cat([one.draws for one, _ in found.values()])
+    samples = {name: points[one.contains(points)] for name, (one, _) in found.items()}
+    samples["posterior"] = next(iter(found.values()))[0].draws
+    names = posterior.parameter_names if parameter_names is None else parameter_names
+    members, truth, labels = as_samples(samples, theta, names)
+    draws = members.pop("posterior")
+    ends = {name: torch.stack([b.low, b.high]) for name, (_, b) in found.items()}
+    shown = [central_interval(draws), *members.values(), *ends.values()]
+    shown += [] if truth is None else [truth[None]]
+    shown = torch.cat([one.to(draws) for one in shown]).nan_to_num(posinf=0, neginf=0)
+    limits = with_margin(shown.amin(dim=0), shown.amax(dim=0))
+    figure = empty_figure(2.0 * len(labels) + 0.8, 2.0 * len(labels) + 1.0)
     for axes, pair in corner_panels(figure, labels, limits, truth):
         if len(pair) == 1:
-            draw_marginal(axes, samples[:, pair[0]], {"color": GREY})
-            for name, found in intervals.items():
-                for end in (found.low[pair[0]], found.high[pair[0]]):
-                    axes.axvline(float(end), **STYLES[name], lw=1.8)
+            draw_marginal(axes, draws[:, pair[0]], {"color": GREY})
+            for name, end in ends.items():
+                for value in end[:, pair[0]].tolist():
+                    axes.axvline(value, **STYLES[name], lw=1.8, markevery=[])
             continue
-        for name, value in draws.items():
-            colour, (x, y) = STYLES[name]["color"], value[:, pair].T.numpy()
-            axes.scatter(x, y, s=5, color=colour, lw=0, rasterized=True)
+        for name in sorted(found, key=lambda name: -found[name][0].volume):
+            colour, columns = STYLES[name]["color"], members[name][:, pair].T.numpy()
+            axes.scatter(*columns, s=5, color=colour, lw=0, rasterized=True)
     from matplotlib.lines import Line2D
 
-    styles = {name: {**STYLES[name], "marker": "o", "ms": 4} for name in intervals}
-    handles = [
-        Line2D([], [], label=f"{100 * level:.4g} %, {name}", **style)
-        for name, style in styles.items()
-    ]
+    of = f"{100 * level:.4g} %"
+    handles = [Line2D([], [], label=f"{of}, {k}", **STYLES[k]) for k in found]
     corner_legend(figure, handles, truth)
     return figure
-
-
-def _limits(
-    draws: Mapping[str, Tensor],
-    intervals: Mapping[str, CredibleIntervals],
-    truth: Tensor | None,
-) -> Tensor:
-    """Return limits of the axes that hold sets, intervals and the truth, ``(2, d)``."""
-    spans = [central_interval(draws["posterior"])]
-    spans += [
-        torch.stack([value.amin(dim=0), value.amax(dim=0)])
-        for name, value in draws.items()
-        if name != "posterior" and len(value)
-    ]
-    spans += [
-        torch.stack([one.low, one.high]).to(spans[0]) for one in intervals.values()
-    ]
-    if truth is not None:
-        spans.append(truth.expand(2, -1))
-    low, high = torch.stack(spans).nan_to_num(posinf=0.0, neginf=0.0).unbind(dim=1)
-    return with_margin(low.amin(dim=0), high.amax(dim=0))

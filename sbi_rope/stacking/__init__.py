@@ -10,11 +10,7 @@ from sbi_rope.stacking.candidates import (
     UnlabelledCandidate,
     default_candidates,
 )
-from sbi_rope.stacking.cross_validation import (
-    SetScores,
-    StackingWeights,
-    stacking_weights,
-)
+from sbi_rope.stacking.cross_validation import StackingWeights, stacking_weights
 from sbi_rope.stacking.data import StackData
 from sbi_rope.stacking.posterior import StackedPosterior
 from sbi_rope.stacking.report import LearningCurve, StackingReport
@@ -28,7 +24,6 @@ __all__ = [
     "LearningCurve",
     "NPECandidate",
     "PriorCandidate",
-    "SetScores",
     "StackData",
     "StackedPosterior",
     "StackingReport",

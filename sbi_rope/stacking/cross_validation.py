@@ -7,16 +7,10 @@ import torch
 from torch import Tensor
 
 from sbi_rope.errors import InvalidInputError, warn_user
-from sbi_rope.sets.conformal import check_enough, rank_needed
 from sbi_rope.settings import Count, NotNegative, Positive, check
 from sbi_rope.tensors import as_batch, as_numbers
 
-__all__ = [
-    "SetScores",
-    "StackingWeights",
-    "fold_weights",
-    "stacking_weights",
-]
+__all__ = ["StackingWeights", "fold_weights", "stacking_weights"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -150,51 +144,6 @@ def _checked_scores(
             "candidate."
         )
     return scores[known], of_pairs.to(scores)[known]
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class SetScores:
-    """The held-out scores that sets with a guarantee are made from.
-
-    Attributes:
-        joint: The level of the smallest set of highest density that contains the true
-            parameters, shape ``(n,)``. It is above 1 if their density is lower than
-            that of all draws, see :func:`sbi_rope.sets.conformal.joint_scores`.
-        marginal: The level of the smallest central interval of each parameter that
-            contains the true one, shape ``(n, d)``. It is above 1 beyond all draws, see
-            :func:`sbi_rope.sets.conformal.marginal_scores`.
-        is_counted: The pairs that count, shape ``(n,)``. Those of one group are not
-            exchangeable one by one. One of them counts, chosen at random. Pairs whose
-            label is not exact do not count, and their scores are NaN.
-        weights: The weights of the stack that scored each fold, shape ``(F, K)``.
-        num_draws: The number of draws that the scores were computed from.
-    """
-
-    joint: Tensor
-    marginal: Tensor
-    is_counted: Tensor
-    weights: Tensor
-    num_draws: int
-
-    def __len__(self) -> int:
-        return int(self.is_counted.sum())
-
-    def share_held(self, level: float) -> float:
-        """Return the share of pairs in their sets of highest density of a level."""
-        return float((self.joint[self.is_counted] <= level).double().mean())
-
-    def level_needed(self, level: float) -> float:
-        """Return the level of the sets of highest density that a guarantee needs.
-
-        A set with a guarantee is about as large as a set of highest density of this
-        level. Above 1 it reaches further than all draws.
-
-        Raises:
-            InvalidInputError: If there are too few pairs for the level.
-        """
-        check_enough(level, len(self))
-        rank = rank_needed(level, len(self))
-        return float(self.joint[self.is_counted].kthvalue(rank).values)
 
 
 def fold_weights(

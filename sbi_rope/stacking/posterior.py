@@ -1,6 +1,5 @@
-"""The stack of candidates as an sbi posterior, and its sets with a guarantee."""
+"""The stack of candidates as an sbi posterior."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -8,27 +7,13 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_rope._sbi import MixedDensity
 from sbi_rope.density import Density, Flow, Mixture, MixturePosterior
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.sets import CredibleIntervals, CredibleSet, Guarantee
-from sbi_rope.sets.conformal import (
-    check_enough,
-    interval_of,
-    is_held,
-    joint_scores,
-    marginal_ends,
-    rank_needed,
-)
-from sbi_rope.stacking.cross_validation import SetScores
+from sbi_rope.sets import SetScores
 from sbi_rope.stacking.report import StackingReport
 from sbi_rope.tensors import as_batch, check_same_length
 
 __all__ = ["StackedPosterior", "Versions", "fold_posterior", "mixture_of"]
-
-# How far the draws that the volume of a set is estimated from are moved from their
-# mean.
-STRETCHES = (1.0, 2.0, 4.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,203 +162,13 @@ class StackedPosterior(MixturePosterior):
         log_probs = [one.average.log_prob(theta[None], x)[0] for one in self.versions]
         return torch.stack(log_probs, dim=1).double()
 
-    def _held_out_sets(self) -> "HeldOutSets":
-        return HeldOutSets(self)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class HeldOutRule:
-    """The parameters whose scores are not higher than those of most pairs.
-
-    Attributes:
-        posteriors: The stack that has not seen each fold.
-        x: The observation.
-        draws: Log densities of draws of each posterior at x, shape ``(K, M)``.
-        scores: The scores of the pairs that count, shape ``(n,)``.
-        fold: The fold of each of them, shape ``(n,)``.
-        level: The level that was asked for.
-    """
-
-    posteriors: tuple[MixturePosterior, ...]
-    x: Tensor
-    draws: Tensor
-    scores: Tensor
-    fold: Tensor
-    level: float
-
-    def contains(self, theta: Tensor) -> Tensor:
-        """Return whether parameters ``(n, d)`` are in the set, shape ``(n,)``.
-
-        Those outside the prior's support have infinite scores, and are not.
-        """
-        log_probs = [
-            _log_prob(posterior, theta, self.x) for posterior in self.posteriors
-        ]
-        at_theta = joint_scores(torch.stack(log_probs), self.draws)
-        return is_held(self.scores, self.fold, at_theta, level=self.level)
-
-
-class HeldOutSets:
-    """Makes sets with a guarantee from the held-out scores of a stack.
-
-    The scores are those of the stacks that have not seen a fold, and a new observation
-    is scored by the same stacks, with as many draws.
-
-    Args:
-        posterior: The stack.
-    """
-
-    def __init__(self, posterior: StackedPosterior) -> None:
-        self._posterior = posterior
-        self._report = posterior.report
-
-    @torch.no_grad()
-    def credible_set(self, level: float, x: Tensor, num_samples: int) -> CredibleSet:
-        """Return a set with a guarantee, see ``MixturePosterior.credible_set``.
-
-        If the stack is too narrow, the set reaches further than its draws. A quarter of
-        the draws that the volume is estimated from are therefore those of the stack,
-        two quarters the same at two and at four times their distance from the mean,
-        and a quarter those of the prior.
-        """
-        scores, guarantee = self._scores(level)
-        counted = scores.is_counted
-        _check_finite(scores.joint[counted], level)
-        theta, log_density = self._spread(x, num_samples)
-        posteriors = self._posteriors(scores)
-        draws = [
-            _log_prob(posterior, _sample(posterior, x, scores)[:, 0], x)
-            for posterior in posteriors
-        ]
-        rule = HeldOutRule(
-            posteriors=posteriors,
-            x=x,
-            draws=torch.stack(draws),
-            scores=scores.joint[counted].to(x.device),
-            fold=self._report.fold[counted].to(x.device),
-            level=level,
-        )
-        return CredibleSet.of(
-            rule,
-            theta,
-            log_density,
-            level=level,
-            log_unit=float(self._posterior.prior.log_units().sum()),
-            guarantee=guarantee,
-        )
-
-    @torch.no_grad()
-    def credible_intervals(self, level: float, x: Tensor) -> CredibleIntervals:
-        """Return intervals with a guarantee for each observation, each by itself.
-
-        The score of a pair is the level of the smallest central interval that contains
-        its parameter. At x this score gives an interval under the posterior of its
-        fold. The interval with a guarantee ends at quantiles of the ends of these n
-        intervals, and at the end of the prior's support.
-        """
-        scores, guarantee = self._scores(level)
-        low, high = [], []
-        for number, posterior in enumerate(self._posteriors(scores)):
-            rows = scores.is_counted & (self._report.fold == number)
-            draws = _sample(posterior, x, scores).permute(1, 2, 0)
-            of_pairs = scores.marginal[rows].T.to(draws.device)
-            ends = marginal_ends(of_pairs.expand(len(x), -1, -1), draws)
-            low.append(ends[0].permute(2, 0, 1))
-            high.append(ends[1].permute(2, 0, 1))
-        ends = interval_of(torch.cat(low), torch.cat(high), level=level)
-        least, most = self._posterior.prior.bounds(ends[0])
-        return CredibleIntervals(
-            low=ends[0].clamp(least, most).to(x),
-            high=ends[1].clamp(least, most).to(x),
-            level=level,
-            guarantee=guarantee,
-        )
-
-    def _scores(self, level: float) -> tuple[SetScores, Guarantee]:
-        """Return the scores and what they promise; raise if there are too few."""
-        scores = self._report.set_scores
-        if scores is None:
+    def _held_out(self) -> tuple[SetScores, list[MixturePosterior]]:
+        if (scores := self.report.set_scores) is None:
             raise InvalidInputError(
                 "Expected some exact labels for a set with a guarantee; got "
-                f"{self._report.labels}."
+                f"{self.report.labels}."
             )
-        check_enough(level, len(scores))
-        guarantee = Guarantee(
-            level=level,
-            num_pairs=len(scores),
-            num_folds=self._report.num_folds,
-        )
-        return scores, guarantee
-
-    def _posteriors(self, scores: SetScores) -> tuple[MixturePosterior, ...]:
-        """Return the stack that has not seen each fold."""
-        return tuple(
-            fold_posterior(
-                mixture_of(self._posterior.versions, weights, version=number),
-                self._posterior.prior,
-            )
+        return scores, [
+            fold_posterior(mixture_of(self.versions, weights, number), self.prior)
             for number, weights in enumerate(scores.weights)
-        )
-
-    def _spread(self, x: Tensor, num_samples: int) -> tuple[Tensor, Tensor]:
-        r"""Return draws that reach further than the stack, and their log density.
-
-        .. math:: q(\theta) = \frac14 \Big( p(\theta) + \sum_{s \in \{1, 2, 4\}}
-            s^{-d}\, p\big(\mu + (\theta - \mu) / s \mid x\big) \Big)
-
-        Here :math:`\mu` is the mean of the draws. Mixed discrete and continuous
-        parameters are not stretched, because they would be between the categories.
-        """
-        posterior, prior = self._posterior, self._posterior.prior
-        modules = posterior.posterior_estimator.modules()
-        is_mixed = any(isinstance(module, MixedDensity) for module in modules)
-        stretches = STRETCHES[:1] if is_mixed else STRETCHES
-        count = math.ceil(num_samples / (1 + len(stretches)))
-        draws = posterior.sample((count,), x=x, show_progress_bars=False)
-        mean = draws.mean(dim=0)
-        theta = torch.cat(
-            [
-                prior.sample((count,)).to(draws),
-                *(_stretched(draws, mean, by=stretch) for stretch in stretches),
-            ]
-        )
-        shrunk = [_stretched(theta, mean, by=1 / stretch) for stretch in stretches]
-        # In one call, because the mass inside the support is estimated in each.
-        log_prob = posterior.log_prob(torch.cat(shrunk), x=x).double()
-        scales = torch.tensor(stretches).to(log_prob).log() * theta.shape[1]
-        terms = torch.cat(
-            [
-                prior.log_prob(theta).to(log_prob)[None],
-                log_prob.reshape(len(stretches), -1) - scales[:, None],
-            ]
-        )
-        return theta, terms.logsumexp(dim=0) - math.log(len(terms))
-
-
-def _sample(posterior: MixturePosterior, x: Tensor, scores: SetScores) -> Tensor:
-    """Draw as often as for the scores of the pairs, ``(M, B, d)``."""
-    return posterior.sample_batched((scores.num_draws,), x, show_progress_bars=False)
-
-
-def _log_prob(posterior: MixturePosterior, theta: Tensor, x: Tensor) -> Tensor:
-    """Return the log density up to a constant, which scores do not depend on.
-
-    The constant is the mass inside the prior's support, which takes long to estimate.
-    """
-    return posterior.log_prob(theta, x=x, norm_posterior=False)
-
-
-def _stretched(theta: Tensor, centre: Tensor, *, by: float) -> Tensor:
-    return theta if by == 1 else centre + by * (theta - centre)
-
-
-def _check_finite(scores: Tensor, level: float) -> None:
-    """Raise if so many labels are impossible that a set would hold everything."""
-    impossible = int(torch.isinf(scores).sum())
-    if impossible > len(scores) - rank_needed(level, len(scores)):
-        raise InvalidInputError(
-            "Expected labels that the held-out stack gives a density above zero; got "
-            f"{impossible} of {len(scores)} without, so that a set of level {level:g} "
-            "would hold every parameter. Leave out labels outside the prior's support, "
-            "ask for a smaller level, or add the prior to the candidates."
-        )
+        ]

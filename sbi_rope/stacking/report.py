@@ -13,9 +13,9 @@ from torch import Tensor
 from sbi_rope._statistics import Estimate, TwoSampleTest
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.metrics import Evaluation
+from sbi_rope.sets import SetScores
 from sbi_rope.settings import Count, check, one_of
 from sbi_rope.stacking.cross_validation import (
-    SetScores,
     StackingWeights,
     fold_weights,
     stacking_weights,

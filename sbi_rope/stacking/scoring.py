@@ -17,9 +17,9 @@ from sbi_rope.labels import nodes_of, reference_of
 from sbi_rope.metrics import Evaluation, draw_samples
 from sbi_rope.metrics.calls import draw_chunks
 from sbi_rope.metrics.evaluation import estimates_and_ranks
-from sbi_rope.sets.conformal import joint_scores, marginal_scores
+from sbi_rope.sets import SetScores, joint_scores, marginal_scores
 from sbi_rope.stacking.candidates import Candidate
-from sbi_rope.stacking.cross_validation import SetScores, fold_weights
+from sbi_rope.stacking.cross_validation import fold_weights
 from sbi_rope.stacking.data import StackData
 from sbi_rope.stacking.posterior import fold_posterior
 from sbi_rope.stacking.report import StackingReport
@@ -117,7 +117,7 @@ def score_folds(
             group=pairs.group if pairs.num_groups < len(pairs) else None,
             parameter_names=data.rope.parameter_names,
         ),
-        set_scores=_set_scores(data, of_stack, weights, seed=seed),
+        set_scores=_set_scores(data, of_stack, fold, weights, seed=seed),
         score_errors=None if pairs.are_exact else of_stack.errors,
         labels="" if is_simple else str(pairs),
     )
@@ -151,7 +151,7 @@ def _score_fold(
 
 
 def _set_scores(
-    data: StackData, of_stack: FoldScores, weights: Tensor, *, seed: int
+    data: StackData, of_stack: FoldScores, fold: Tensor, weights: Tensor, *, seed: int
 ) -> SetScores | None:
     """Return what sets with a guarantee are made from; None without exact labels.
 
@@ -163,10 +163,11 @@ def _set_scores(
         return None
     groups = groups_of(data.pairs.group.cpu()[is_counted])
     is_counted[is_counted.clone()] = one_of_each_group(groups, seed=seed)
+    rows = is_counted.to(fold.device)
     return SetScores(
-        joint=of_stack.joint,
-        marginal=of_stack.marginal,
-        is_counted=is_counted.to(data.pairs.x.device),
+        joint=of_stack.joint[rows],
+        marginal=of_stack.marginal[rows],
+        fold=fold[rows],
         weights=weights,
         num_draws=NUM_SAMPLES,
     )

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from sbi_rope._statistics import Estimate
 from sbi_rope.discrepancy.parameters import is_improbable
 from sbi_rope.metrics.evaluation import FEWEST, LEVEL, verdict_of
-from sbi_rope.sets.conformal import rank_needed
+from sbi_rope.sets import rank_needed
 
 if TYPE_CHECKING:
     from sbi_rope.stacking.report import StackingReport

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sbi_rope.sets.conformal import is_held, joint_scores
+from sbi_rope.sets import is_held, joint_scores, rank_needed
 from sbi_rope.stacking.cross_validation import fold_weights
 
 pytestmark = pytest.mark.slow
@@ -15,30 +15,27 @@ NUM_FOLDS, NUM_DRAWS, DIM, NUM_READINGS = 5, 200, 2, 8
 # Strengths of ridge regression. The weakest has learnt few pairs by heart, and claims
 # to be precise.
 STRENGTHS = (1e-2, 1.0, 10.0, 100.0)
-Model = tuple[Tensor, Tensor]
 
 
 def with_constant(x: Tensor) -> Tensor:
     return torch.cat([x, torch.ones(len(x), 1).to(x)], dim=1)
 
 
-def fitted(theta: Tensor, x: Tensor) -> list[Model]:
-    """Return ridge regressions of theta on x, each with the spread of its residuals."""
-    x = with_constant(x)
-    models = []
+def predicted(theta: Tensor, x: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
+    """Return means ``(n, K, d)`` and deviations ``(K, d)`` of ridge regressions.
+
+    They are trained on theta and x, and the last one is the prior.
+    """
+    x, at = with_constant(x), with_constant(at)
+    means, stds = [], []
     for strength in STRENGTHS:
         gram = x.T @ x + strength * torch.eye(x.shape[1]).to(x)
         coefficients = torch.linalg.solve(gram, x.T @ theta)
+        means.append(at @ coefficients)
         std = (theta - x @ coefficients).std(dim=0, correction=0)
-        models.append((coefficients, std.clamp_min(0.02)))
-    return models
-
-
-def predicted(models: list[Model], x: Tensor) -> tuple[Tensor, Tensor]:
-    """Return means ``(n, K, d)`` and deviations ``(K, d)``; the last is the prior."""
-    means = [with_constant(x) @ coefficients for coefficients, _ in models]
-    mean = torch.stack([*means, torch.zeros(len(x), DIM).to(x)], dim=1)
-    return mean, torch.stack([*(std for _, std in models), torch.ones(DIM).to(x)])
+        stds.append(std.clamp_min(0.02))
+    mean = torch.stack([*means, torch.zeros_like(means[0])], dim=1)
+    return mean, torch.stack([*stds, torch.ones_like(stds[0])])
 
 
 def log_normal(theta: Tensor, mean: Tensor, std: Tensor) -> Tensor:
@@ -67,22 +64,21 @@ def holds(n: int, mixing: Tensor) -> tuple[bool, bool, float]:
     theta = torch.randn(n + 1, DIM).double()
     x = theta @ mixing.T + torch.randn(n + 1, NUM_READINGS) + 0.3 * theta[:, :1] ** 2
     fold = torch.arange(n) % NUM_FOLDS
-    models = [fitted(theta[:n][fold != k], x[:n][fold != k]) for k in range(NUM_FOLDS)]
-    log_scores = theta.new_empty(n, len(STRENGTHS) + 1)
+    log_scores, laws = theta.new_empty(n, len(STRENGTHS) + 1), []
     for k in range(NUM_FOLDS):
-        rows = (fold == k).nonzero().flatten()
-        log_scores[rows] = log_normal(theta[rows, None], *predicted(models[k], x[rows]))
+        rows = torch.cat([(fold == k).nonzero().flatten(), torch.tensor([n])])
+        seen = fold != k
+        laws.append((rows, predicted(theta[:n][seen], x[:n][seen], x[rows])))
+        at_rows = log_normal(theta[rows, None], *laws[k][1])
+        log_scores[rows[:-1]] = at_rows[:-1]
     learnt = fold_weights(log_scores, fold, None)
     held, plain = [], 0.0
     for weights in (learnt, torch.full_like(learnt, 1 / learnt.shape[1])):
         scores, at_new = theta.new_empty(n), theta.new_empty(NUM_FOLDS, 1)
-        for k in range(NUM_FOLDS):
-            rows = (fold == k).nonzero().flatten()
-            with_new = torch.cat([rows, torch.tensor([n])])
-            law = predicted(models[k], x[with_new])
-            found = scored(law, weights[k], theta[with_new])
-            scores[rows], at_new[k] = found[:-1], found[-1]
-        held.append(bool(is_held(scores, fold, at_new, level=0.9)))
+        for k, (rows, law) in enumerate(laws):
+            found = scored(law, weights[k], theta[rows])
+            scores[rows[:-1]], at_new[k] = found[:-1], found[-1]
+        held.append(bool(is_held(scores, fold, at_new, rank=rank_needed(0.9, n))))
         if weights is learnt:
             plain = float((at_new <= 0.9).double().mean())
     return held[0], held[1], plain
