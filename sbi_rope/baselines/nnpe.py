@@ -1,9 +1,8 @@
 """Noisy neural posterior estimation: NPE trained on statistics with errors."""
 
 import copy
-from typing import Any, Literal
+from typing import Any
 
-import torch
 from torch import Tensor
 
 from sbi_rope._sbi import embed, estimator_of, posterior_from
@@ -38,9 +37,10 @@ class NNPE(Method):
     is trained on too. Training starts from NPE, and the noise is drawn anew for every
     batch. A real observation is conditioned on directly.
 
-    Sees simulations, also when it starts from a trained NPE. Assumes that statistics
-    err independently of each other, any of them, and by a few standard deviations
-    rather than by many. It is never as sharp as NPE where the simulator is right.
+    It sees simulations, also when it starts from a trained NPE. It assumes that
+    statistics err independently of each other, any of them, and by a few standard
+    deviations rather than by many. It is never as sharp as NPE where the simulator is
+    right.
 
     References:
         | Robust Neural Posterior Estimation and Statistical Model Criticism
@@ -60,6 +60,7 @@ class NNPE(Method):
     sees = frozenset({"simulations"})
     starts_from_npe = True
     trains_on_statistics = True
+    default_training = Training()
 
     def __init__(
         self,
@@ -68,15 +69,12 @@ class NNPE(Method):
         *,
         noise_on: NoiseOn = "embedding",
         error_model: SpikeAndSlab | None = None,
-        npe_training: Training | None = None,
-        training: Training | None = None,
-        device: str | torch.device = "cpu",
+        **options: Any,
     ) -> None:
-        check("noise_on", noise_on, Literal["embedding", "input"])
-        super().__init__(prior, density_estimator, npe_training, device=device)
+        check("noise_on", noise_on, NoiseOn)
+        super().__init__(prior, density_estimator, **options)
         self.noise_on: NoiseOn = noise_on
         self.error_model = error_model or SpikeAndSlab()
-        self.training = training or Training()
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
@@ -86,10 +84,9 @@ class NNPE(Method):
         statistics = embed(net, x)
         clip = SoftClip(statistics)
         density, estimator = with_clip(estimator, clip, self.noise_on)
-        scale = clip.std
 
         def with_noise(statistics: Tensor) -> Tensor:
-            return statistics + scale * self.error_model.sample_like(statistics)
+            return statistics + clip.std * self.error_model.sample_like(statistics)
 
         trained, history = train_on_simulations(
             self._prior,

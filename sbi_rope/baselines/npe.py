@@ -13,10 +13,9 @@ from torch import Tensor
 
 from sbi_rope._random import seeded
 from sbi_rope.density import PriorPosterior
-from sbi_rope.fit import History, Training
+from sbi_rope.fit import History
 from sbi_rope.simulate import Simulated
 from sbi_rope.trainers.base import Method
-from sbi_rope.trainers.training import EstimatorBuilder
 
 __all__ = ["PlainNPE", "PriorBaseline", "ReferenceNPE"]
 
@@ -28,8 +27,7 @@ class PriorBaseline(Method):
     posterior probability has learnt less than nothing.
 
     Args:
-        prior: A torch distribution over parameters of shape ``(d,)``.
-        device: Where the prior lives.
+        prior, device: See :class:`Method`.
     """
 
     sees = frozenset()
@@ -55,10 +53,7 @@ class PlainNPE(Method):
         | https://arxiv.org/abs/1905.07488
 
     Args:
-        prior: A torch distribution over parameters of shape ``(d,)``.
-        density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns.
-        npe_training: How NPE is trained; ``Training()`` if None.
-        device: Where to train; data on other devices is moved there.
+        prior, density_estimator, npe_training, device: See :class:`Method`.
 
     Example:
         >>> from sbi.utils import BoxUniform
@@ -74,16 +69,6 @@ class PlainNPE(Method):
 
     sees = frozenset({"simulations"})
     starts_from_npe = True
-
-    def __init__(
-        self,
-        prior: Any,
-        density_estimator: str | EstimatorBuilder = "nsf",
-        *,
-        npe_training: Training | None = None,
-        device: str | torch.device = "cpu",
-    ) -> None:
-        super().__init__(prior, density_estimator, npe_training, device=device)
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History | None]:
         return self._trained_npe(show_progress_bars=show_progress_bars)

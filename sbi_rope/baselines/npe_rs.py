@@ -10,11 +10,7 @@ from sbi_rope.errors import warn_user
 from sbi_rope.fit import History, Training
 from sbi_rope.settings import NotNegative, check
 from sbi_rope.trainers.base import Method
-from sbi_rope.trainers.training import (
-    EstimatorBuilder,
-    estimator_builder,
-    train_on_simulations,
-)
+from sbi_rope.trainers.training import EstimatorBuilder, train_on_simulations
 
 __all__ = ["NPERS", "squared_mmd"]
 
@@ -95,12 +91,10 @@ class NPERS(Method):
         | https://arxiv.org/abs/2305.15871
 
     Args:
-        prior: A torch distribution over parameters of shape ``(d,)``.
-        density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns, with an
-            embedding net. The net is copied, never trained in place.
+        prior, density_estimator, device: See :class:`Method`. The estimator should have
+            an embedding net.
         regularisation: The weight :math:`\beta`; at 0 the method is NPE.
         training: How it is trained; ``Training()`` if None.
-        device: Where to train; data on other devices is moved there.
 
     Raises:
         UnsupportedPosteriorError: In ``train``, if the embedding cannot be separated
@@ -108,6 +102,7 @@ class NPERS(Method):
     """
 
     sees = frozenset({"simulations", "observations"})
+    default_training = Training()
 
     def __init__(
         self,
@@ -115,18 +110,14 @@ class NPERS(Method):
         density_estimator: str | EstimatorBuilder = "nsf",
         *,
         regularisation: float = 1.0,
-        training: Training | None = None,
-        device: str | torch.device = "cpu",
+        **options: Any,
     ) -> None:
         check("regularisation", regularisation, NotNegative)
-        super().__init__(prior, device=device)
-        self._build = estimator_builder(density_estimator)
+        super().__init__(prior, density_estimator, **options)
         self.regularisation = regularisation
-        self.training = training or Training()
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         theta, x = self._data.simulations
-
         estimator, history = train_on_simulations(
             self._prior,
             self._build,

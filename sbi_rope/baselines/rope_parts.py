@@ -5,15 +5,12 @@ Data-driven Calibration (Wehenkel et al., 2025), section 4, Baselines,
 https://arxiv.org/abs/2405.08719.
 """
 
-from collections.abc import Callable
 from typing import Any
-
-import torch
 
 from sbi_rope.coupling import SinkhornCoupler
 from sbi_rope.density import MixturePosterior
 from sbi_rope.finetuning import CalibrationFinetuner
-from sbi_rope.fit import History, Training
+from sbi_rope.fit import History
 from sbi_rope.rope import RoPE
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.training import EstimatorBuilder
@@ -27,9 +24,9 @@ class TuningOnly(Method):
     Step 2 of RoPE without step 3: :meth:`RoPE.tuned_posterior
     <sbi_rope.RoPE.tuned_posterior>`.
 
-    Sees simulations and the calibration set, and simulates at the calibration
-    parameters. Assumes that :math:`g(x_o)` lands on the embeddings of simulations; it
-    is sharp, and nothing tempers it where they do not.
+    It sees simulations and the calibration set, and simulates at the calibration
+    parameters. It assumes that :math:`g(x_o)` lands on the embeddings of simulations;
+    it is sharp, and nothing tempers it where they do not.
 
     Args:
         prior, density_estimator, npe_training, device: See :class:`Method`.
@@ -47,14 +44,10 @@ class TuningOnly(Method):
         prior: Any,
         density_estimator: str | EstimatorBuilder = "nsf",
         *,
-        simulator: Callable[[Any], Any] | None = None,
         finetuner: CalibrationFinetuner | None = None,
-        npe_training: Training | None = None,
-        device: str | torch.device = "cpu",
+        **options: Any,
     ) -> None:
-        super().__init__(
-            prior, density_estimator, npe_training, simulator=simulator, device=device
-        )
+        super().__init__(prior, density_estimator, **options)
         self.finetuner = finetuner
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
@@ -76,8 +69,8 @@ class OTOnly(Method):
     Step 3 of RoPE without step 2, g = h. The posterior answers for the appended
     observations only.
 
-    Sees simulations and the observations to be inferred, no labels. Assumes that the
-    prior is right and that h orders real observations as it orders simulations.
+    It sees simulations and the observations to be inferred, no labels. It assumes that
+    the prior is right and that h orders real observations as it orders simulations.
 
     Args:
         prior, density_estimator, npe_training, device: See :class:`Method`.
@@ -99,15 +92,11 @@ class OTOnly(Method):
         prior: Any,
         density_estimator: str | EstimatorBuilder = "nsf",
         *,
-        simulator: Callable[[Any], Any] | None = None,
         coupler: SinkhornCoupler | None = None,
         num_simulations: int | None = None,
-        npe_training: Training | None = None,
-        device: str | torch.device = "cpu",
+        **options: Any,
     ) -> None:
-        super().__init__(
-            prior, density_estimator, npe_training, simulator=simulator, device=device
-        )
+        super().__init__(prior, density_estimator, **options)
         self.coupler = coupler
         self.num_simulations = num_simulations
 

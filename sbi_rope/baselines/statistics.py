@@ -18,10 +18,11 @@ from sbi_rope._sbi import (
     with_embedding,
 )
 from sbi_rope._standardisation import Standardisation
+from sbi_rope.baselines.training import fit_rows
 from sbi_rope.data import split_pairs
 from sbi_rope.density import Density, Flow
 from sbi_rope.ensemble import Ensemble, embedded, log_density
-from sbi_rope.fit import History, Training, fit, shuffled
+from sbi_rope.fit import History, Training
 from sbi_rope.tensors import as_batch
 
 __all__ = [
@@ -192,40 +193,30 @@ def fit_with_jitter(
     *,
     jitter: float,
     training: Training,
-    label: str,
-    show_progress_bars: bool,
+    **options: Any,
 ) -> History:
     """Train a density of statistics with Gaussian noise on them, anew in every batch.
 
     The losses are those at some rows and their noisy statistics. Rows of a group are
-    held out together.
+    held out together. Other options are those of :func:`~sbi_rope.fit.fit`.
     """
-    train, held_out = split_pairs(groups, training.validation_fraction)
 
     def loss(rows: Tensor) -> Tensor:
         return losses(rows, s[rows] + jitter * torch.randn_like(s[rows])).mean()
 
-    [history] = fit(
-        density,
-        lambda epoch: zip(shuffled(train, training.training_batch_size), strict=True),
-        loss,
-        training,
-        validation_loss=(lambda: loss(held_out)) if len(held_out) else None,
-        label=label,
-        show_progress_bars=show_progress_bars,
-    )
-    return history
+    split = split_pairs(groups, training.validation_fraction)
+    return fit_rows(density, loss, split, training, **options)
 
 
 @torch.no_grad()
 def _start_as_standard_normal(flow: nn.Module) -> None:
     """Shrink the outputs of the networks, at zero of which splines are the identity."""
     for module in flow.modules():
-        outputs: nn.Module | None = None
         if isinstance(module, nn.Sequential) and isinstance(module[-1], nn.Linear):
             outputs = module[-1]
         elif isinstance(module, nn.ParameterList):
             outputs = module  # a single statistic, with no network
-        if outputs is not None:
-            for parameter in outputs.parameters():
-                parameter.mul_(SHRINKAGE)
+        else:
+            continue
+        for parameter in outputs.parameters():
+            parameter.mul_(SHRINKAGE)
