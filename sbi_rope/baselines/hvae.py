@@ -1,7 +1,6 @@
 """The hybrid VAE (HVAE): a deterministic simulator inside of an auto-encoder."""
 
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -9,7 +8,6 @@ from torch import Tensor
 
 from sbi_rope._random import seeded
 from sbi_rope._sbi import posterior_from
-from sbi_rope._standardisation import ROUNDING
 from sbi_rope.baselines.hvae_model import (
     ContinuedPrior,
     HybridVAE,
@@ -18,24 +16,18 @@ from sbi_rope.baselines.hvae_model import (
 )
 from sbi_rope.baselines.networks import ConditionalUNet
 from sbi_rope.baselines.statistics import OverDraws, frozen_statistics
+from sbi_rope.baselines.training import fit_rows
 from sbi_rope.data import split_pairs, too_few_pairs
 from sbi_rope.density import Density
 from sbi_rope.ensemble import embedded
 from sbi_rope.errors import InvalidInputError, warn_user
-from sbi_rope.fit import History, Training, fit
+from sbi_rope.fit import History, Training
 from sbi_rope.settings import Count, check
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.training import EstimatorBuilder
 
 __all__ = ["HVAE"]
 
-DEFAULT_TRAINING = Training(
-    training_batch_size=100,
-    learning_rate=1e-3,
-    validation_fraction=0.2,
-    stop_after_epochs=30,
-    max_num_epochs=100,
-)
 # Length of z, its draws behind the posterior, and behind the loss on held-out pairs.
 LATENT_DIM, NUM_LATENTS, NUM_LATENTS_HELD_OUT = 5, 64, 8
 # Most entries of series or images that the U-Net sees at a time.
@@ -64,13 +56,14 @@ class HVAE(Method):
     layer. An observation has m entries. The posterior mixes :math:`q(\theta \mid
     h(\tilde x))` over 64 draws of z whose noise is fixed.
 
-    Sees simulations, the calibration set and observations without parameters. Their
+    It sees simulations, the calibration set and observations without parameters. Their
     means and standard deviations scale the data; a part of the pairs is held out, and
     the epoch with the largest log-probability on them is kept, the start included. Of
     fewer than 5 pairs none is held out, and the objective on held-out observations
-    decides; of fewer than 5 observations the last epoch is kept. Assumes series or
+    decides; of fewer than 5 observations the last epoch is kept. It assumes series or
     images, a simulator that can be differentiated once its noise is left out, and a
-    prior on a box. The densities stay as narrow as those of NPE.
+    prior on a box, whose sides may be infinite. The densities stay as narrow as those
+    of NPE.
 
     References:
         | Physics-Integrated Variational Autoencoders for Robust and Interpretable
@@ -81,27 +74,30 @@ class HVAE(Method):
         | https://arxiv.org/abs/2405.08719
 
     Args:
-        prior: A torch distribution over parameters of shape ``(d,)``, its support a
-            box, whose sides may be infinite.
+        prior, npe_training, device: See :class:`Method`.
         density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns; a
             normalizing flow of nflows or zuko.
         physics: f, from theta ``(n, d)`` to ``(n, *event)``: the simulator without
             noise and nuisances, differentiable by torch.
-        npe_training: How NPE is trained; ``Training()`` if None.
         training: How the networks are trained; at most 100 passes over the observations
             in batches of 100 at a learning rate of 1e-3, and 30 without improvement, if
             None.
         width: Channels of the first block of the U-Nets. The paper has 64; 8 takes a
             fraction of the time on a CPU.
-        device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidInputError: If the prior's support is not a box. In ``train``, if the
-            physics is not differentiable.
+        InvalidInputError: In ``train``, if the physics is not differentiable.
     """
 
     sees = frozenset({"simulations", "calibration", "observations"})
     starts_from_npe = True
+    default_training = Training(
+        training_batch_size=100,
+        learning_rate=1e-3,
+        validation_fraction=0.2,
+        stop_after_epochs=30,
+        max_num_epochs=100,
+    )
 
     def __init__(
         self,
@@ -109,62 +105,41 @@ class HVAE(Method):
         density_estimator: str | EstimatorBuilder = "nsf",
         *,
         physics: Callable[[Tensor], Tensor],
-        npe_training: Training | None = None,
-        training: Training | None = None,
         width: int = 64,
-        device: str | torch.device = "cpu",
+        **options: Any,
     ) -> None:
         check("width", width, Count)
-        super().__init__(prior, density_estimator, npe_training, device=device)
-        self._continued_prior = ContinuedPrior(self._prior)
-        self.training = training or DEFAULT_TRAINING
+        super().__init__(prior, density_estimator, **options)
         self.physics = physics
         self.width = width
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         with seeded(0):
-            theta = self._prior.sample(torch.Size((1,))).to(self._device, torch.float32)
-            if not self.physics(theta.requires_grad_()).requires_grad:
+            theta = self._prior.sample((1,)).requires_grad_()
+            if not self.physics(theta).requires_grad:
                 raise InvalidInputError(
                     "Expected `physics` to be differentiable by torch; got a result "
                     "without gradients."
                 )
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
-        model = self._model(npe)
-        # On the CPU, so that a seed means the same on every device.
-        noise = torch.randn(NUM_LATENTS, LATENT_DIM, device="cpu").to(self._device)
-        event_shape = self._data.observations.shape[1:]
-        posterior, held_out = (
-            OverLatents(model, noise[:count], event_shape)
-            for count in (NUM_LATENTS, NUM_LATENTS_HELD_OUT)
-        )
-        history = self._train(model, held_out, show_progress_bars=show_progress_bars)
-        return posterior_from(npe, posterior.eval()), history
-
-    def _model(self, npe: Any) -> HybridVAE:
         h, density = frozen_statistics(npe)
         x = torch.cat([self._data.observations, self._data.calibration[1]])
-        # One number a channel: pixels that never change have no standard deviation. Nor
-        # has a channel that only rounding changes.
-        channels = x.transpose(0, 1).flatten(1) if x.ndim == 4 else x.reshape(1, -1)
-        std, mean = torch.std_mean(channels, dim=1)
-        unet = partial(
-            ConditionalUNet,
-            tuple(x.shape[1:]),
-            LATENT_DIM,
-            width=self.width,
-            mean=mean,
-            std=std.where(std > ROUNDING * mean.abs(), 1.0),
-        )
         model = HybridVAE(
             LatentEncoder(h, LATENT_DIM, x),
-            unet(),
-            unet(),
+            ConditionalUNet(x, LATENT_DIM, width=self.width),
+            ConditionalUNet(x, LATENT_DIM, width=self.width),
             npe=(h, density),
             physics=self.physics,
-            prior=self._continued_prior,
+            prior=ContinuedPrior(self._prior),
+        ).to(self._device)
+        # On the CPU, so that a seed means the same on every device.
+        noise = torch.randn(NUM_LATENTS, LATENT_DIM, device="cpu").to(self._device)
+        posterior, scored = (
+            OverLatents(model, noise[:count], x.shape[1:])
+            for count in (NUM_LATENTS, NUM_LATENTS_HELD_OUT)
         )
-        return model.to(self._device)
+        history = self._train(model, scored, show_progress_bars=show_progress_bars)
+        return posterior_from(npe, posterior.eval()), history
 
     def _train(
         self, model: HybridVAE, scored: Density, *, show_progress_bars: bool
@@ -176,49 +151,35 @@ class HVAE(Method):
         theta, x = self._data.calibration
         x_o, training = self._data.observations, self.training
         train, held_out = split_pairs(theta, training.validation_fraction)
-        pairs = theta[train], x[train]
-        validation_loss: Callable[[], Tensor] | None = None
-        if len(held_out):
-
-            def loss_of_pairs() -> Tensor:
-                return -scored.log_prob(theta[held_out], x[held_out]).mean()
-
-            validation_loss = loss_of_pairs
-        else:
+        rows, by_pairs = torch.arange(len(x_o)), len(held_out) > 0
+        if not by_pairs:
             warn_user(
                 f"{too_few_pairs(theta)}: none is held out, and the networks "
                 "are chosen by the objective on held-out observations. Append at least "
                 "5 pairs of different parameters to choose them by what matters."
             )
-            rows, held_out = split_pairs(
-                torch.arange(len(x_o)), training.validation_fraction
-            )
-            left_out, x_o = x_o[held_out], x_o[rows]
+            rows, held_out = split_pairs(rows, training.validation_fraction)
+        unlabelled = torch.cat([x_o[rows], x[train]])
 
-            def objective() -> Tensor:
-                with seeded(0):  # or the luckiest epoch would be kept
-                    return model.objective(left_out, *pairs)
+        def loss(rows: Tensor) -> Tensor:
+            some = train[torch.randperm(len(train))[: training.training_batch_size]]
+            return model.objective(unlabelled[rows], theta[some], x[some])
 
-            validation_loss = objective if len(held_out) else None
-        unlabelled = torch.cat([x_o, pairs[1]])
+        def validation_loss(held_out: Tensor) -> Tensor:
+            if by_pairs:
+                return -scored.log_prob(theta[held_out], x[held_out]).mean()
+            with seeded(0):  # or the luckiest epoch would be kept
+                return model.objective(x_o[held_out], theta[train], x[train])
 
-        def batches(epoch: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-            """Pass over all observations, each batch together with one of pairs."""
-            size = training.training_batch_size
-            for rows in torch.randperm(len(unlabelled)).split(size):
-                some = torch.randperm(len(pairs[1]))[:size]
-                yield unlabelled[rows], pairs[0][some], pairs[1][some]
-
-        [history] = fit(
+        return fit_rows(
             model,
-            batches,
-            model.objective,
+            loss,
+            (torch.arange(len(unlabelled)), held_out),
             training,
             validation_loss=validation_loss,
             label="HVAE",
             show_progress_bars=show_progress_bars,
         )
-        return history
 
 
 class OverLatents(OverDraws):
@@ -228,12 +189,8 @@ class OverLatents(OverDraws):
         \tfrac1S \sum_k q(\theta \mid h(\mathrm{R2P}(x_o, z_k))), \quad
         z_k = m(x_o) + \sigma(x_o) \, \epsilon_k
 
-    The noise is the same for all observations.
-
-    Args:
-        model: The model, whose networks are shared.
-        noise: :math:`\epsilon`, shape ``(S, l_z)``.
-        event_shape: Shape of one observation.
+    The noise :math:`\epsilon`, ``(S, l_z)``, is the same for all observations. The
+    networks are those of the model.
     """
 
     noise: Tensor
@@ -249,23 +206,12 @@ class OverLatents(OverDraws):
     @torch.no_grad()
     def embed(self, x: Tensor) -> Tensor:
         """Return the embeddings, ``(n, *event)`` to ``(n, S, l)``."""
-        size = self.condition_shape.numel()
-        num_rows = max(1, MAX_ENTRIES // (size * self.num_members))
-        num_draws = max(1, MAX_ENTRIES // size)
-        return torch.cat(
-            [
-                torch.cat(
-                    [self._block(rows, some) for some in self.noise.split(num_draws)],
-                    dim=1,
-                )
-                for rows in x.split(num_rows)
-            ]
-        )
-
-    def _block(self, x_o: Tensor, noise: Tensor) -> Tensor:
-        """Return the embeddings of some draws, ``(b, s, l)``."""
-        mean, log_variance = (moment[:, None] for moment in self.encoder(x_o))
-        z = drawn(mean, log_variance, noise).flatten(0, 1)
-        x_s, _ = self.reality_to_physics(x_o, z)
-        s = self.nets.answer(embedded, x_s)
-        return s.unflatten(0, (len(x_o), len(noise)))
+        count, parts = self.num_members, []
+        size = MAX_ENTRIES // (self.condition_shape.numel() * count)
+        for some in x.split(max(1, size)):
+            mean, log_variance = (moment[:, None] for moment in self.encoder(some))
+            z = drawn(mean, log_variance, self.noise).flatten(0, 1)
+            x_s, _ = self.reality_to_physics(some, z)
+            s = self.nets.answer(embedded, x_s)
+            parts.append(s.unflatten(0, (len(some), count)))
+        return torch.cat(parts)

@@ -9,9 +9,7 @@ from torch import Tensor, nn
 from torch.distributions import Distribution
 
 from sbi_rope._prior import PriorDistribution
-from sbi_rope._random import seeded
 from sbi_rope.baselines.networks import bounded, embedding_with_head
-from sbi_rope.errors import InvalidInputError
 
 __all__ = ["ContinuedPrior", "HybridVAE", "LatentEncoder", "drawn"]
 
@@ -19,8 +17,6 @@ __all__ = ["ContinuedPrior", "HybridVAE", "LatentEncoder", "drawn"]
 # its ends the support is cut, in standard deviations of the prior. Some densities, that
 # of the light tunnel's polarisers for one, are infinite at the ends.
 FLANK, MARGIN = 0.1, 1e-3
-# Draws that tell the standard deviations.
-NUM_DRAWS = 10_000
 
 
 class HybridVAE(nn.Module):
@@ -35,16 +31,8 @@ class HybridVAE(nn.Module):
         z \sim q(z \mid x_o), \quad \theta \sim q(\theta \mid h(\tilde x_s)), \quad
         \tilde x_s = \mathrm{R2P}(x_o, z),
 
-    the second one a frozen NPE.
-
-    Args:
-        encoder: From x_o to mean and log-variance of z.
-        reality_to_physics: R2P, from (x_o, z) to mean and log-variance, which has no
-            use.
-        physics_to_reality: P2R, likewise.
-        npe: h and :math:`q(\theta \mid h)`, frozen.
-        physics: f, from theta ``(n, d)`` to ``(n, *event)``, differentiable.
-        prior: p(theta).
+    the second one a frozen NPE. Each network returns a mean and a log-variance; that of
+    R2P has no use. The physics maps theta ``(n, d)`` to ``(n, *event)``.
     """
 
     def __init__(
@@ -95,10 +83,7 @@ class HybridVAE(nn.Module):
     def objective(self, x_o: Tensor, theta: Tensor, x: Tensor) -> Tensor:
         """Return what is minimised: pairs weigh like all entries of an observation.
 
-        Args:
-            x_o: Observations without parameters, shape ``(n, *event)``.
-            theta: Parameters of calibration pairs, shape ``(m, d)``.
-            x: Their observations, shape ``(m, *event)``.
+        Observations x_o are ``(n, *event)``; pairs, ``(m, d)`` and ``(m, *event)``.
         """
         log_prob = self.calibration_log_prob(theta, x)
         return -self.elbo(x_o).mean() - x_o[0].numel() * log_prob.mean()
@@ -138,26 +123,13 @@ class ContinuedPrior:
 
     A flow puts some of its mass outside of the support. There the ELBO would be minus
     infinity and without a gradient; this one is finite and leads back inside.
-
-    Args:
-        prior: A torch distribution over parameters of shape ``(d,)``, its support a
-            box, whose sides may be infinite.
     """
 
     def __init__(self, prior: Distribution) -> None:
         self._prior = PriorDistribution(prior)
-        with seeded(0):
-            draws = self._prior.sample((NUM_DRAWS,))
-        std = draws.std(dim=0)
-        # In a box, any parameters between the bounds are inside.
-        apart = self._prior.off_bounds(2.0 * draws - draws.mean(dim=0))
-        if not self._prior.inside(apart).all():
-            raise InvalidInputError(
-                f"Expected a prior whose support is a box; got {type(prior).__name__}."
-            )
-        self.std = std
-        low, high = self._prior.bounds(std)
-        self.low, self.high = low + MARGIN * std, high - MARGIN * std
+        self.std = self._prior.stddev
+        low, high = self._prior.bounds(self.std)
+        self.low, self.high = low + MARGIN * self.std, high - MARGIN * self.std
 
     def nearest(self, theta: Tensor) -> Tensor:
         """Return the nearest points in the box, ``(n, d)``."""
@@ -180,14 +152,8 @@ def reparametrised_sample(flow: Any, condition: Tensor) -> Tensor:
         \frac{\partial \theta}{\partial s} = -\left(
         \frac{\partial T}{\partial \theta} \right)^{-1} \frac{\partial T}{\partial s}.
 
-    Only :math:`T` is differentiated, so that flows may be inverted by a search.
-
-    Args:
-        flow: A flow of sbi without embedding net.
-        condition: Its conditions s, shape ``(n, l)``.
-
-    Returns:
-        Parameters, shape ``(n, d)``.
+    Only :math:`T` is differentiated, so that flows may be inverted by a search. The
+    flow has no embedding net; conditions are ``(n, l)``, and parameters ``(n, d)``.
     """
     with torch.no_grad():
         theta = flow.sample(torch.Size((1,)), condition)[0]

@@ -8,6 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from sbi_rope._sbi import embed
+from sbi_rope._standardisation import ROUNDING
 
 __all__ = ["ConditionalUNet", "bounded", "embedding_with_head", "fresh_copy"]
 
@@ -39,8 +40,7 @@ def embedding_with_head(
     """Return a fresh embedding net followed by a linear layer.
 
     Where the embedding has no parameters, two hidden layers of 64 units stand between.
-
-    Some observations ``(n, *event)`` tell the width of an embedding.
+    Its width is that of the embedding of x.
     """
     embedding = fresh_copy(embedding)
     width = embed(embedding, x[:1]).flatten(1).shape[1]
@@ -72,31 +72,21 @@ class ConditionalUNet(nn.Module):
           et al., 2015)
         | https://arxiv.org/abs/1505.04597
 
-    Args:
-        event_shape: ``(length,)`` of a series or ``(channels, height, width)`` of an
-            image.
-        latent_dim: Length of the latent vector.
-        width: Channels of the first block.
-        mean: Mean of the data, shape ``(channels,)``.
-        std: Standard deviation of the data, shape ``(channels,)``.
+    The data are series, ``(n, length)``, or images, ``(n, channels, height, width)``.
     """
 
     mean: Tensor
     std: Tensor
 
-    def __init__(
-        self,
-        event_shape: tuple[int, ...],
-        latent_dim: int,
-        *,
-        width: int,
-        mean: Tensor,
-        std: Tensor,
-    ) -> None:
+    def __init__(self, data: Tensor, latent_dim: int, *, width: int) -> None:
         super().__init__()
         # A series is an image of one channel with one side.
-        self.shape = event_shape if len(event_shape) == 3 else (1, *event_shape)
+        self.shape = data.shape[1:] if data.ndim == 4 else (1, *data.shape[1:])
         channels, *sides = self.shape
+        of_each = data.reshape(-1, *self.shape).transpose(0, 1).flatten(1)
+        std, mean = torch.std_mean(of_each, dim=1)
+        # A channel that only rounding changes has no standard deviation.
+        std = std.where(std > ROUNDING * mean.abs(), 1.0)
         column = (channels, *(1 for _ in sides))
         self.register_buffer("mean", mean.reshape(column))
         self.register_buffer("std", std.reshape(column))
@@ -122,10 +112,7 @@ class ConditionalUNet(nn.Module):
     def forward(self, x: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and log-variance in the units of x, ``(n * S, *event)``.
 
-        Args:
-            x: Series or images, shape ``(n, *event)``.
-            z: Latent vectors, S for the first x, then S for the second and so on, shape
-                ``(n * S, latent_dim)``.
+        Of the latent vectors, ``(n * S, latent_dim)``, the first S are for the first x.
         """
         inputs = (x.reshape(len(x), *self.shape) - self.mean) / self.std
         outputs = self._outputs(_padded(inputs), z)
@@ -158,16 +145,12 @@ def bounded(log_variance: Tensor) -> Tensor:
 
 def _block(before: int, after: int, *, is_series: bool) -> nn.Sequential:
     """Return two convolutions; batch normalisation between them in images alone."""
+    conv = nn.Conv1d if is_series else nn.Conv2d
     layers: list[nn.Module] = []
     for channels in (before, after):
-        if is_series:
-            layers += [nn.Conv1d(channels, after, 3, padding=1), nn.ReLU()]
-        else:
-            layers += [
-                nn.Conv2d(channels, after, 3, padding=1, bias=False),
-                nn.BatchNorm2d(after),
-                nn.ReLU(),
-            ]
+        layers.append(conv(channels, after, 3, padding=1, bias=is_series))
+        layers += [] if is_series else [nn.BatchNorm2d(after)]
+        layers.append(nn.ReLU())
     return nn.Sequential(*layers)
 
 
