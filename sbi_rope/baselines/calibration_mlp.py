@@ -17,7 +17,7 @@ from sbi_rope._sbi import (
 from sbi_rope.baselines.networks import embedding_with_head
 from sbi_rope.baselines.training import fit_rows
 from sbi_rope.data import split_pairs
-from sbi_rope.fit import History, Training, epochs_on_pairs
+from sbi_rope.fit import History, Training
 from sbi_rope.trainers.base import Method
 
 __all__ = ["CalibrationMLP", "DiagonalGaussian"]
@@ -160,9 +160,7 @@ class CalibrationMLP(Method):
             lambda rows: estimator.loss(theta[rows], x[rows]).mean(),
             split,
             self.training,
-            max_num_epochs=epochs_on_pairs(
-                theta, held_out, self.training.max_num_epochs
-            ),
+            pairs=theta,
             label="MLP",
             show_progress_bars=show_progress_bars,
         )

@@ -15,8 +15,6 @@ __all__ = ["BOUND", "SpikeAndSlab", "denoise", "split_r_hat"]
 
 # Draws of noise farther out are put here, since networks see them: 8e-5 of all.
 BOUND = 1e3
-# Observations whose chains run side by side; more of them gain nothing.
-GROUP_SIZE = 50
 # Widest bracket of the slice sampler; it also ends the search where a density is flat.
 MAX_WIDTH = 50.0
 
@@ -91,7 +89,7 @@ def denoise(
         log_density: :math:`\log q` of statistics, ``(m, l)`` to ``(m,)``.
         simulated: Standardised simulated statistics, shape ``(n_s, l)``.
         error_model: :math:`p(y \mid s)`, with :math:`\sigma` its ``spike_std``.
-        num_draws: Draws of each observation, of all chains together.
+        num_draws: Draws of each observation, of all its chains together.
         num_chains: Chains of each observation.
         warmup: Sweeps that each chain starts with and that are thrown away.
         thin: Sweeps for every draw kept.
@@ -100,32 +98,39 @@ def denoise(
         Draws of s, shape ``(n, num_draws, l)``, and the largest split-R-hat of the
         statistics of each observation, shape ``(n,)``.
     """
-    draws, r_hats = [], []
-    for part in y.split(GROUP_SIZE):
-        rows = part.repeat_interleave(num_chains, dim=0).double()
-        sampler = SliceSamplerVectorized(
-            _log_target(rows, log_density, error_model, y.dtype),
-            _starts(part, simulated, error_model, num_chains),
-            num_chains=len(rows),
-            tuning=warmup,  # all of what is not kept serves to tune the brackets
-            init_width=1.0,
-            max_width=MAX_WIDTH,
-            verbose=False,
-        )
-        z = torch.as_tensor(sampler.run(math.ceil(num_draws / num_chains) * thin))
-        z = z.to(y.device).unflatten(0, (len(part), num_chains))
-        r_hats.append(split_r_hat(z).amax(dim=-1))
-        noise = error_model.spike_std * torch.sinh(z)[:, :, thin - 1 :: thin]
-        s = part[:, None, None] - noise
-        # Alternating between the chains, so that dropping the last ones of an uneven
-        # number takes from all alike.
-        draws.append(s.transpose(1, 2).flatten(1, 2)[:, :num_draws])
-    return torch.cat(draws).to(y), torch.cat(r_hats).to(y)
+    rows = y.repeat_interleave(num_chains, dim=0).double()
+
+    @torch.no_grad()
+    def log_target(states: np.ndarray) -> np.ndarray:
+        z = torch.as_tensor(states).to(rows)
+        noise = error_model.spike_std * torch.sinh(z)
+        log_q = log_density((rows - noise).to(y)).double()
+        # The last two terms are the log of dn/dz up to a constant.
+        terms = error_model.log_prob(noise) + torch.logaddexp(z, -z)
+        return (log_q + terms.sum(dim=-1)).nan_to_num(nan=-torch.inf).cpu().numpy()
+
+    starts = _starts(y, simulated, error_model, num_chains)
+    sampler = SliceSamplerVectorized(
+        log_target,
+        starts.double().cpu().numpy(),
+        num_chains=len(rows),
+        tuning=warmup,  # all of what is not kept serves to tune the brackets
+        init_width=1.0,
+        max_width=MAX_WIDTH,
+        verbose=False,
+    )
+    z = torch.as_tensor(sampler.run(math.ceil(num_draws / num_chains) * thin))
+    z = z.to(rows).unflatten(0, (len(y), num_chains))
+    noise = error_model.spike_std * torch.sinh(z)[:, :, thin - 1 :: thin]
+    # Alternating between the chains, so that dropping the last ones of an uneven
+    # number takes from all alike.
+    s = (y[:, None, None] - noise).transpose(1, 2).flatten(1, 2)[:, :num_draws]
+    return s.to(y), split_r_hat(z).amax(dim=-1).to(y)
 
 
 def _starts(
     y: Tensor, simulated: Tensor, error_model: SpikeAndSlab, num_chains: int
-) -> np.ndarray:
+) -> Tensor:
     """Return the first z of each chain, ``(n * num_chains, l)``."""
     starts = []
     for one in y:  # one at a time: n times n_s times l may be large
@@ -134,27 +139,7 @@ def _starts(
         # Of fewer simulations than chains some serve twice.
         nearest = nearest[torch.arange(num_chains - 1) % max(1, len(nearest))]
         starts.append(one - torch.cat([one[None], simulated[nearest]]))
-    return torch.asinh(torch.cat(starts) / error_model.spike_std).double().cpu().numpy()
-
-
-def _log_target(
-    y: Tensor,
-    log_density: Callable[[Tensor], Tensor],
-    error_model: SpikeAndSlab,
-    dtype: torch.dtype,
-) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the log density of the z of all chains, up to constants."""
-
-    @torch.no_grad()
-    def log_target(states: np.ndarray) -> np.ndarray:
-        z = torch.as_tensor(states).to(y)
-        noise = error_model.spike_std * torch.sinh(z)
-        log_q = log_density((y - noise).to(dtype)).double()
-        # The last two terms are the log of dn/dz up to a constant.
-        terms = error_model.log_prob(noise) + torch.logaddexp(z, -z)
-        return (log_q + terms.sum(dim=-1)).nan_to_num(nan=-torch.inf).cpu().numpy()
-
-    return log_target
+    return torch.asinh(torch.cat(starts) / error_model.spike_std)
 
 
 def split_r_hat(draws: Tensor) -> Tensor:

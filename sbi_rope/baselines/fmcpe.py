@@ -24,7 +24,7 @@ from sbi_rope.baselines.training import fit_rows
 from sbi_rope.data import split_pairs
 from sbi_rope.density import Density
 from sbi_rope.ensemble import drawn
-from sbi_rope.fit import History, Training, epochs_on_pairs
+from sbi_rope.fit import History, Training
 from sbi_rope.settings import Positive, check
 from sbi_rope.simulate import draws
 from sbi_rope.trainers.base import Method
@@ -77,10 +77,7 @@ class FMCPE(Method):
         | https://arxiv.org/abs/2509.23385
 
     Args:
-        prior, density_estimator, npe_training, device: See :class:`Method`.
-        simulator: Maps parameters to simulations, batched or not. Without one, the
-            appended simulations with the nearest parameters take the place of
-            simulations at the calibration parameters.
+        prior, density_estimator, npe_training, simulator, device: See :class:`Method`.
         space: Where observations are mapped to simulations: as they are (``"input"``,
             as published), or by their embedding, h(x_o) to h(x).
         noise: :math:`\epsilon`, in standard deviations of the simulations. The paper
@@ -88,9 +85,6 @@ class FMCPE(Method):
             way to a simulation starts at standard normal noise alone.
         training: How the fields are trained, at a rate that falls to zero along a
             cosine; 300 epochs in batches of 256 if None.
-
-    Raises:
-        UnsupportedPosteriorError: In ``train``, if the estimator has no density.
     """
 
     sees = frozenset({"simulations", "calibration"})
@@ -152,7 +146,7 @@ class FMCPE(Method):
             to_simulations, self._prior, self._field(x, seen_in, h, size=theta.shape[1])
         ).to(self._device)
         history = self._train(pushed, bank, show_progress_bars=show_progress_bars)
-        return direct_posterior(pushed.eval(), self._prior), history
+        return direct_posterior(pushed, self._prior), history
 
     def _field(
         self, x: Tensor, unit: Standardise, h: nn.Module, *, size: int
@@ -160,7 +154,7 @@ class FMCPE(Method):
         """Return an untrained velocity field of so many entries."""
         condition: nn.Module
         if self.space == "embedding":
-            condition = nn.Sequential(Frozen(copy.deepcopy(h)), nn.Flatten(), unit)
+            condition = nn.Sequential(copy.deepcopy(h), nn.Flatten(), unit)
         elif x[0].numel() > MAX_SUMMARIES and any(True for _ in h.parameters()):
             condition = nn.Sequential(fresh_copy(h), nn.Flatten())
         else:
@@ -191,21 +185,12 @@ class FMCPE(Method):
             split,
             self.training,
             validation_loss=held_out_loss,
-            max_num_epochs=epochs_on_pairs(
-                theta, split[1], self.training.max_num_epochs
-            ),
+            pairs=theta,
             decay=True,
+            in_training_mode=False,
             label="FMCPE",
             show_progress_bars=show_progress_bars,
         )
-
-
-class Frozen(nn.Sequential):
-    """A net that stays in evaluation mode while what contains it is trained."""
-
-    def train(self, mode: bool = True) -> "Frozen":  # noqa: FBT001, FBT002
-        """Do not switch to training mode."""
-        return super().train(mode=False)
 
 
 class ToSimulations(OverDraws):

@@ -15,7 +15,7 @@ from sbi_rope.data import split_pairs
 from sbi_rope.density import Density, Flow, MixturePosterior, OverSimulations
 from sbi_rope.ensemble import Ensemble, embedded, log_density
 from sbi_rope.finetuning import trainable_copy
-from sbi_rope.fit import History, Training, epochs_on_pairs
+from sbi_rope.fit import History, Training
 from sbi_rope.settings import Positive, check
 from sbi_rope.simulate import targets
 from sbi_rope.trainers.base import Method
@@ -68,16 +68,11 @@ class FRISBI(Method):
         | https://arxiv.org/abs/2508.15593
 
     Args:
-        prior, density_estimator, npe_training, device: See :class:`Method`.
-        simulator: Maps parameters to simulations, batched or not. Without one, the
-            appended simulations take its place.
+        prior, density_estimator, npe_training, simulator, device: See :class:`Method`.
         gamma: :math:`\gamma`, in units of the mean squared difference of embeddings.
         distilled: Whether the posterior is :math:`q_\phi`.
         training: How g is trained, in batches of observations, each with all pairs; 100
             epochs in batches of 64 if None.
-
-    Raises:
-        UnsupportedPosteriorError: In ``train``, if the estimator has no density.
     """
 
     sees = frozenset({"simulations", "calibration", "observations"})
@@ -150,9 +145,7 @@ class FRISBI(Method):
             (torch.arange(len(x_o)), held_out),
             self.training,
             validation_loss=error,
-            max_num_epochs=epochs_on_pairs(
-                theta, held_out, self.training.max_num_epochs
-            ),
+            pairs=theta,
             in_training_mode=False,
             label="FRISBI",
             show_progress_bars=show_progress_bars,

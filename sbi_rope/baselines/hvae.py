@@ -17,10 +17,9 @@ from sbi_rope.baselines.hvae_model import (
 from sbi_rope.baselines.networks import ConditionalUNet
 from sbi_rope.baselines.statistics import OverDraws, frozen_statistics
 from sbi_rope.baselines.training import fit_rows
-from sbi_rope.data import split_pairs, too_few_pairs
-from sbi_rope.density import Density
+from sbi_rope.data import split_pairs
 from sbi_rope.ensemble import embedded
-from sbi_rope.errors import InvalidInputError, warn_user
+from sbi_rope.errors import InvalidInputError
 from sbi_rope.fit import History, Training
 from sbi_rope.settings import Count, check
 from sbi_rope.trainers.base import Method
@@ -58,12 +57,10 @@ class HVAE(Method):
 
     It sees simulations, the calibration set and observations without parameters. Their
     means and standard deviations scale the data; a part of the pairs is held out, and
-    the epoch with the largest log-probability on them is kept, the start included. Of
-    fewer than 5 pairs none is held out, and the objective on held-out observations
-    decides; of fewer than 5 observations the last epoch is kept. It assumes series or
-    images, a simulator that can be differentiated once its noise is left out, and a
-    prior on a box, whose sides may be infinite. The densities stay as narrow as those
-    of NPE.
+    the epoch with the largest log-probability on them is kept, the start included. It
+    assumes series or images, a simulator that can be differentiated once its noise is
+    left out, and a prior on a box, whose sides may be infinite. The densities stay as
+    narrow as those of NPE.
 
     References:
         | Physics-Integrated Variational Autoencoders for Robust and Interpretable
@@ -123,63 +120,42 @@ class HVAE(Method):
                 )
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
         h, density = frozen_statistics(npe)
-        x = torch.cat([self._data.observations, self._data.calibration[1]])
+        seen = torch.cat([self._data.observations, self._data.calibration[1]])
         model = HybridVAE(
-            LatentEncoder(h, LATENT_DIM, x),
-            ConditionalUNet(x, LATENT_DIM, width=self.width),
-            ConditionalUNet(x, LATENT_DIM, width=self.width),
+            LatentEncoder(h, LATENT_DIM, seen),
+            ConditionalUNet(seen, LATENT_DIM, width=self.width),
+            ConditionalUNet(seen, LATENT_DIM, width=self.width),
             npe=(h, density),
             physics=self.physics,
             prior=ContinuedPrior(self._prior),
         ).to(self._device)
         # On the CPU, so that a seed means the same on every device.
         noise = torch.randn(NUM_LATENTS, LATENT_DIM, device="cpu").to(self._device)
+        # They share the networks of the model.
         posterior, scored = (
-            OverLatents(model, noise[:count], x.shape[1:])
+            OverLatents(model, noise[:count], seen.shape[1:])
             for count in (NUM_LATENTS, NUM_LATENTS_HELD_OUT)
         )
-        history = self._train(model, scored, show_progress_bars=show_progress_bars)
-        return posterior_from(npe, posterior.eval()), history
-
-    def _train(
-        self, model: HybridVAE, scored: Density, *, show_progress_bars: bool
-    ) -> History:
-        """Train in place; held out are pairs, or observations if pairs are few.
-
-        The density shares the networks of the model, to score held-out pairs by.
-        """
         theta, x = self._data.calibration
-        x_o, training = self._data.observations, self.training
-        train, held_out = split_pairs(theta, training.validation_fraction)
-        rows, by_pairs = torch.arange(len(x_o)), len(held_out) > 0
-        if not by_pairs:
-            warn_user(
-                f"{too_few_pairs(theta)}: none is held out, and the networks "
-                "are chosen by the objective on held-out observations. Append at least "
-                "5 pairs of different parameters to choose them by what matters."
-            )
-            rows, held_out = split_pairs(rows, training.validation_fraction)
-        unlabelled = torch.cat([x_o[rows], x[train]])
+        train, held_out = split_pairs(theta, self.training.validation_fraction)
+        unlabelled = torch.cat([self._data.observations, x[train]])
 
         def loss(rows: Tensor) -> Tensor:
-            some = train[torch.randperm(len(train))[: training.training_batch_size]]
+            order = train[torch.randperm(len(train))]
+            some = order[: self.training.training_batch_size]
             return model.objective(unlabelled[rows], theta[some], x[some])
 
-        def validation_loss(held_out: Tensor) -> Tensor:
-            if by_pairs:
-                return -scored.log_prob(theta[held_out], x[held_out]).mean()
-            with seeded(0):  # or the luckiest epoch would be kept
-                return model.objective(x_o[held_out], theta[train], x[train])
-
-        return fit_rows(
+        history = fit_rows(
             model,
             loss,
             (torch.arange(len(unlabelled)), held_out),
-            training,
-            validation_loss=validation_loss,
+            self.training,
+            validation_loss=lambda rows: scored.loss(theta[rows], x[rows]).mean(),
+            pairs=theta,
             label="HVAE",
             show_progress_bars=show_progress_bars,
         )
+        return posterior_from(npe, posterior.eval()), history
 
 
 class OverLatents(OverDraws):

@@ -9,8 +9,7 @@ from torch import Tensor
 from sbi_rope._sbi import direct_posterior, embedding_of
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope.baselines.training import fit_rows
-from sbi_rope.data import split_pairs, too_few_pairs
-from sbi_rope.errors import warn_user
+from sbi_rope.data import split_pairs
 from sbi_rope.fit import History, Training
 from sbi_rope.trainers.base import Method
 
@@ -26,7 +25,7 @@ class JointNPE(Method):
 
     An epoch is one pass over the simulations; the calibration pairs beside them are
     drawn with replacement. A part of the calibration pairs is held out and the network
-    that does best on it is kept; below five pairs the held-out data are simulations.
+    that does best on it is kept; of fewer than five pairs none is held out.
 
     It sees simulations and the calibration set. It assumes nothing about the
     misspecification and so has to learn it from the pairs alone, which takes hundreds
@@ -49,27 +48,16 @@ class JointNPE(Method):
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         theta, x = self._data.simulations
         theta_cal, x_cal = self._data.calibration
-        fraction = self.training.validation_fraction
-        pairs, held_out = split_pairs(theta_cal, fraction)
-        rows = torch.arange(len(x))
-        scored = theta_cal[held_out], x_cal[held_out]
-        if not len(held_out):
-            # Nothing real to choose by; simulations at least say when to stop.
-            warn_user(
-                f"{too_few_pairs(theta_cal)}: none is held out, and the best network "
-                "is chosen on simulations."
-            )
-            rows, held_out = split_pairs(theta, fraction)
-            scored = theta[held_out], x[held_out]
+        train, held_out = split_pairs(theta_cal, self.training.validation_fraction)
         # As in NPE, the simulations alone say how x and theta are standardised.
-        estimator = self._build(theta[rows].cpu(), x[rows].cpu()).to(self._device)
+        estimator = self._build(theta.cpu(), x.cpu()).to(self._device)
         warn_of_far_entries("x", x_cal, embedding_of(estimator))
 
         def loss_of(theta: Tensor, x: Tensor) -> Tensor:
             return estimator.loss(theta, condition=x).mean()
 
         def loss(rows: Tensor) -> Tensor:
-            beside = pairs[torch.randint(len(pairs), (len(rows),))]
+            beside = train[torch.randint(len(train), (len(rows),))]
             return loss_of(
                 torch.cat([theta[rows], theta_cal[beside]]),
                 torch.cat([x[rows], x_cal[beside]]),
@@ -79,9 +67,10 @@ class JointNPE(Method):
         history = fit_rows(
             estimator,
             loss,
-            (rows, held_out),
+            (torch.arange(len(x)), held_out),
             replace(self.training, training_batch_size=half),
-            validation_loss=lambda held_out: loss_of(*scored),
+            validation_loss=lambda pairs: loss_of(theta_cal[pairs], x_cal[pairs]),
+            pairs=theta_cal,
             label="J-NPE",
             show_progress_bars=show_progress_bars,
         )

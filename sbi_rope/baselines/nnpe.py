@@ -52,9 +52,6 @@ class NNPE(Method):
         noise_on: Where the noise goes: ``"embedding"`` or ``"input"``.
         error_model: The noise; ``SpikeAndSlab()`` if None.
         training: How training goes on with noise; ``Training()`` if None.
-
-    Raises:
-        UnsupportedPosteriorError: In ``train``, if the estimator has no density.
     """
 
     sees = frozenset({"simulations"})

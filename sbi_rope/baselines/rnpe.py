@@ -144,9 +144,6 @@ class RNPE(Method):
         warmup: Sweeps over the statistics that each chain starts with.
         thin: Sweeps for every draw kept.
         training: How q(s) is trained; ``Training()`` if None.
-
-    Raises:
-        UnsupportedPosteriorError: In ``train``, if the estimator has no density.
     """
 
     sees = frozenset({"simulations"})

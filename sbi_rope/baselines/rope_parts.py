@@ -29,9 +29,7 @@ class TuningOnly(Method):
     it is sharp, and nothing tempers it where they do not.
 
     Args:
-        prior, density_estimator, npe_training, device: See :class:`Method`.
-        simulator: Maps parameters to simulations, batched or not. Without one, the
-            targets come from the appended simulations with the nearest parameters.
+        prior, density_estimator, npe_training, simulator, device: See :class:`Method`.
         finetuner: Settings of the fine-tuning; ``CalibrationFinetuner()`` if None.
     """
 
@@ -73,9 +71,7 @@ class OTOnly(Method):
     the prior is right and that h orders real observations as it orders simulations.
 
     Args:
-        prior, density_estimator, npe_training, device: See :class:`Method`.
-        simulator: Maps parameters to simulations, batched or not. Without one, the
-            appended simulations are coupled with.
+        prior, density_estimator, npe_training, simulator, device: See :class:`Method`.
         coupler: Settings of the transport; ``SinkhornCoupler()`` if None.
         num_simulations: n_s; as many as there are observations, at least 1000, if None.
 

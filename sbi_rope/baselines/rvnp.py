@@ -77,11 +77,6 @@ class RVNP(Method):
     such as an offset that a shift of all parameters would explain as well, is not
     found. It also assumes Gaussian errors, and at least some tens of observations.
 
-    The paper has two error models, the default here and RVNP-G, which is
-    ``depends_on_theta=False``. The offset, ``shift=True``, is part of what the code
-    calls its primary method. An offset can be taken for other parameters, so that it
-    helps only where the prior tells the two apart.
-
     References:
         | Robust Variational Neural Posterior Estimation for Simulation-Based Inference
           (O'Callaghan et al., 2025)
@@ -93,7 +88,8 @@ class RVNP(Method):
             it is, or the ``"input"``, whose shape must be ``(l,)`` then.
         shift: Whether errors have an offset, :math:`\mu + \mu(\theta)`.
         depends_on_theta: Whether :math:`\mu(\theta)` and :math:`\sigma(\theta)` are
-            networks; otherwise :math:`\mu(\theta)` is zero and :math:`\sigma` constant.
+            networks; otherwise (RVNP-G) :math:`\mu(\theta)` is zero and
+            :math:`\sigma` constant.
         surrogate_training: How :math:`p(s \mid \theta)` is trained; ``Training()`` if
             None.
         training: How errors and posterior are trained, in batches of observations; at
@@ -101,7 +97,6 @@ class RVNP(Method):
 
     Raises:
         InvalidInputError: In ``train``, if no statistic varies or one is missing (NaN).
-        UnsupportedPosteriorError: In ``train``, if the estimator has no density.
     """
 
     sees = frozenset({"simulations", "observations"})

@@ -171,8 +171,13 @@ class Method(ABC):
         training: How the networks of the method itself are trained; its
             ``default_training`` if None.
         simulator: Maps parameters to simulations, batched or not, for a method that
-            simulates.
+            simulates. Without one, appended simulations take its place; those at given
+            parameters are the ones with the nearest parameters.
         device: Where to train; data on other devices is moved there.
+
+    Raises:
+        UnsupportedPosteriorError: In ``train``, if the method needs a density and the
+            estimator has none, or if its embedding cannot be separated.
     """
 
     sees: ClassVar[frozenset[Kind]]
