@@ -14,8 +14,7 @@ from sbi_rope._sbi import (
     embedding_of,
     leave_out_constants,
 )
-from sbi_rope.baselines.networks import embedding_with_head
-from sbi_rope.baselines.training import fit_rows
+from sbi_rope.baselines.networks import embedding_with_head, fit_rows
 from sbi_rope.data import split_pairs
 from sbi_rope.fit import History, Training
 from sbi_rope.trainers.base import Method

@@ -18,9 +18,8 @@ from sbi_rope.baselines.flow_matching import (
     follow_back,
     matching_loss,
 )
-from sbi_rope.baselines.networks import fresh_copy
+from sbi_rope.baselines.networks import fit_rows, fresh_copy
 from sbi_rope.baselines.statistics import OverDraws, frozen_statistics
-from sbi_rope.baselines.training import fit_rows
 from sbi_rope.data import split_pairs
 from sbi_rope.density import Density
 from sbi_rope.ensemble import drawn

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 
 from sbi_rope._sbi import ConditionalDensityEstimator, embed
 from sbi_rope._standardisation import warn_of_far_entries
+from sbi_rope.baselines.networks import fit_rows
 from sbi_rope.baselines.statistics import frozen_statistics
-from sbi_rope.baselines.training import fit_rows
 from sbi_rope.data import split_pairs
 from sbi_rope.density import Density, Flow, MixturePosterior, OverSimulations
 from sbi_rope.ensemble import Ensemble, embedded, log_density

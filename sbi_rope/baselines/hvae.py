@@ -9,14 +9,13 @@ from torch import Tensor
 from sbi_rope._random import seeded
 from sbi_rope._sbi import posterior_from
 from sbi_rope.baselines.hvae_model import (
+    ConditionalUNet,
     ContinuedPrior,
     HybridVAE,
     LatentEncoder,
-    drawn,
 )
-from sbi_rope.baselines.networks import ConditionalUNet
+from sbi_rope.baselines.networks import fit_rows
 from sbi_rope.baselines.statistics import OverDraws, frozen_statistics
-from sbi_rope.baselines.training import fit_rows
 from sbi_rope.data import split_pairs
 from sbi_rope.ensemble import embedded
 from sbi_rope.errors import InvalidInputError
@@ -185,9 +184,9 @@ class OverLatents(OverDraws):
         count, parts = self.num_members, []
         size = MAX_ENTRIES // (self.condition_shape.numel() * count)
         for some in x.split(max(1, size)):
-            mean, log_variance = (moment[:, None] for moment in self.encoder(some))
-            z = drawn(mean, log_variance, self.noise).flatten(0, 1)
-            x_s, _ = self.reality_to_physics(some, z)
+            law = self.encoder(some)
+            z = law.mean[:, None] + law.stddev[:, None] * self.noise
+            x_s = self.reality_to_physics(some, z.flatten(0, 1)).mean
             s = self.nets.answer(embedded, x_s)
             parts.append(s.unflatten(0, (len(some), count)))
         return torch.cat(parts)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from sbi_rope._sbi import direct_posterior, embedding_of
 from sbi_rope._standardisation import warn_of_far_entries
-from sbi_rope.baselines.training import fit_rows
+from sbi_rope.baselines.networks import fit_rows
 from sbi_rope.data import split_pairs
 from sbi_rope.fit import History, Training
 from sbi_rope.trainers.base import Method

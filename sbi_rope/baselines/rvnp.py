@@ -17,6 +17,7 @@ from torch.distributions import (
 from sbi_rope._random import seeded
 from sbi_rope._sbi import embed, estimator_of, gaussians_of, posterior_from
 from sbi_rope._standardisation import Standardisation
+from sbi_rope.baselines.networks import fit_rows
 from sbi_rope.baselines.statistics import (
     NoiseOn,
     SoftClip,
@@ -25,7 +26,6 @@ from sbi_rope.baselines.statistics import (
     standardisation_of_statistics,
     with_clip,
 )
-from sbi_rope.baselines.training import fit_rows
 from sbi_rope.data import split_pairs
 from sbi_rope.fit import History, Training
 from sbi_rope.settings import check

@@ -18,7 +18,7 @@ from sbi_rope._sbi import (
     with_embedding,
 )
 from sbi_rope._standardisation import Standardisation
-from sbi_rope.baselines.training import fit_rows
+from sbi_rope.baselines.networks import fit_rows
 from sbi_rope.data import split_pairs
 from sbi_rope.density import Density, Flow
 from sbi_rope.ensemble import Ensemble, embedded, log_density
