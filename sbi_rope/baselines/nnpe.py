@@ -1,18 +1,12 @@
 """Noisy neural posterior estimation: NPE trained on statistics with errors."""
 
-import copy
 from typing import Any
 
 from torch import Tensor
 
-from sbi_rope._sbi import embed, estimator_of, posterior_from
+from sbi_rope._sbi import embed, posterior_from
 from sbi_rope.baselines.error_model import SpikeAndSlab
-from sbi_rope.baselines.statistics import (
-    NoiseOn,
-    SoftClip,
-    split_at_statistics,
-    with_clip,
-)
+from sbi_rope.baselines.statistics import NoiseOn, clipped_statistics
 from sbi_rope.fit import History, Training
 from sbi_rope.settings import check
 from sbi_rope.trainers.base import Method
@@ -75,12 +69,8 @@ class NNPE(Method):
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
-        estimator = copy.deepcopy(estimator_of(npe)).requires_grad_()
-        net, _ = split_at_statistics(estimator, self.noise_on)
         theta, x = self._data.simulations
-        statistics = embed(net, x)
-        clip = SoftClip(statistics)
-        density, estimator = with_clip(estimator, clip, self.noise_on)
+        net, clip, density, estimator = clipped_statistics(npe, self.noise_on, x)
 
         def with_noise(statistics: Tensor) -> Tensor:
             return statistics + clip.std * self.error_model.sample_like(statistics)
@@ -90,7 +80,7 @@ class NNPE(Method):
             # sbi tries it on the CPU, and moves it to the data's device.
             lambda theta, x: density.cpu(),
             theta,
-            statistics,
+            embed(net, x),
             training=self.training,
             show_progress_bars=show_progress_bars,
             change_x=with_noise,  # anew in every batch

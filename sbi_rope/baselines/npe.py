@@ -43,9 +43,8 @@ class PlainNPE(Method):
         \min_q\; \mathbb{E}_{p(\theta)\, p(x_s \mid \theta)}
         \bigl[-\log q(\theta \mid h(x_s))\bigr]
 
-    A thin cover of ``sbi.inference.NPE``. It sees simulations, and assumes that the
-    simulator is right: nothing else here is as sharp then, and none is as wrong if it
-    is not.
+    It sees simulations, and assumes that the simulator is right: nothing else here is
+    as sharp then, and none is as wrong if it is not.
 
     References:
         | Automatic Posterior Transformation for Likelihood-free Inference
@@ -86,22 +85,19 @@ class ReferenceNPE(PlainNPE):
     def simulated_test_set(
         self, theta: Tensor, simulator: Callable[[Any], Any], *, seed: int | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Return the test parameters, each with one simulation.
+        """Return test parameters ``(n, d)``, each with one simulation.
 
         Args:
-            theta: Test parameters, shape ``(n, d)``.
+            theta: Test parameters.
             simulator: Maps parameters to simulations, batched or not.
-            seed: Seed of the simulations; None uses the states of torch, NumPy and
-                Python.
+            seed: Seed of the simulations; None uses the present random state.
 
         Returns:
             Parameters and simulations, without those that are not finite.
         """
         theta = self._data.read_theta(theta)
-        event_shape = self._data.event_shape or torch.Size()
+        shape = self._data.event_shape or torch.Size()
         with seeded(seed):
-            x = Simulated(simulator, self._prior, event_shape=event_shape, like=theta)(
-                theta
-            )
+            x = Simulated(simulator, self._prior, event_shape=shape, like=theta)(theta)
         valid = torch.isfinite(x).flatten(1).all(dim=1)
         return theta[valid], x[valid]

@@ -96,29 +96,15 @@ class OTOnly(Method):
         self.coupler = coupler
         self.num_simulations = num_simulations
 
-    def build_rope(self) -> RoPE:
-        """Return the RoPE of a trained NPE without pairs, to couple at many settings.
-
-        The appended observations and ``coupler.gamma`` play no part in it.
-
-        Raises:
-            NotReadyError: If it needs simulations that were not appended.
-        """
-        if self.needs_simulations:
-            self._check_data("simulations")
-        return self._rope_of(self._given_npe)
-
-    def _rope_of(self, npe: Any) -> RoPE:
-        return RoPE(
+    def _fit(self, *, show_progress_bars: bool) -> tuple[MixturePosterior, Any]:
+        npe, history = self._trained_npe(show_progress_bars=show_progress_bars)
+        rope = RoPE(
             npe,
             simulator=self._simulator,
             simulations=self._looked_up,
             coupler=self.coupler,
         )
-
-    def _fit(self, *, show_progress_bars: bool) -> tuple[MixturePosterior, Any]:
-        npe, history = self._trained_npe(show_progress_bars=show_progress_bars)
-        posterior = self._rope_of(npe).build_posterior(
+        posterior = rope.build_posterior(
             self._data.observations,
             num_simulations=self.num_simulations,
             show_progress_bars=show_progress_bars,

@@ -1,6 +1,5 @@
 r"""Robust variational neural posterior estimation (RVNP)."""
 
-import copy
 from typing import Any
 
 import torch
@@ -15,16 +14,14 @@ from torch.distributions import (
 )
 
 from sbi_rope._random import seeded
-from sbi_rope._sbi import embed, estimator_of, gaussians_of, posterior_from
+from sbi_rope._sbi import embed, gaussians_of, posterior_from
 from sbi_rope._standardisation import Standardisation
 from sbi_rope.baselines.networks import fit_rows
 from sbi_rope.baselines.statistics import (
     NoiseOn,
-    SoftClip,
+    clipped_statistics,
     fit_with_jitter,
-    split_at_statistics,
     standardisation_of_statistics,
-    with_clip,
 )
 from sbi_rope.data import split_pairs
 from sbi_rope.fit import History, Training
@@ -43,8 +40,7 @@ HIDDEN = 128
 NUM_COMPONENTS = 5
 # Standard deviation of the errors before training.
 START = 0.5
-# Noise on simulated statistics, without which those that depend on each other have no
-# density, and the smallest standard deviation of an error.
+# Noise on simulated statistics, and the smallest standard deviation of an error.
 JITTER, SMALLEST = 0.01, 1e-3
 
 
@@ -130,13 +126,11 @@ class RVNP(Method):
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
-        estimator = copy.deepcopy(estimator_of(npe)).requires_grad_()
-        net, _ = split_at_statistics(estimator, self.noise_on)
         theta, x = self._data.simulations
+        net, _, density, estimator = clipped_statistics(npe, self.noise_on, x)
         simulated, observed = embed(net, x), embed(net, self._data.observations)
         standardise = standardisation_of_statistics(simulated)
         observed = as_batch("statistics of x_o", observed)
-        density, estimator = with_clip(estimator, SoftClip(simulated), self.noise_on)
         s, y = standardise(simulated), standardise(observed)
         surrogate = fit_surrogate(
             theta,
@@ -288,7 +282,6 @@ def fit_surrogate(
     surrogate = build(theta.cpu(), s.cpu()).to(s.device)
     fit_with_jitter(
         surrogate,
-        lambda rows, noisy: surrogate.loss(noisy, condition=theta[rows]),
         s,
         theta,
         jitter=JITTER,
