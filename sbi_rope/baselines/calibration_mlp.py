@@ -67,13 +67,8 @@ class DiagonalGaussian(ConditionalDensityEstimator):
         """Bound the mean by draws of the prior, and the deviation by the error.
 
         Far from what it was trained on, a network can be sure of something wrong
-        without bound. An observation can also carry its mean out of the prior's
-        support, where no draw would ever be accepted.
-
-        Args:
-            theta: Parameters of held-out pairs, shape ``(n, d)``.
-            x: Their observations, shape ``(n, *event)``.
-            draws: Draws of the prior, shape ``(m, d)``.
+        without bound, and its mean can leave the prior's support, where no draw would
+        ever be accepted. The pairs are those of the hold-out set.
         """
         error = (theta - self.law(x).mean) / self.std
         # As if two more pairs were off by a standard deviation of the prior: a few
@@ -117,14 +112,10 @@ class CalibrationMLP(Method):
 
     The network is the embedding net of the density estimator, its parameters drawn
     anew, with linear outputs for mean and log-variance. Where the estimator has no
-    embedding net, it has two hidden layers of 64 units. Parameters are standardised by
-    the prior. The network that is best on a hold-out set is kept. No standard deviation
-    is below a tenth of the root mean square error there, and no mean is outside the
-    range of the prior. Entries of x that are the same in all pairs are left out.
+    embedding net, it has two hidden layers of 64 units. The network that is best on a
+    hold-out set is kept. Entries of x that are the same in all pairs are left out.
 
     It sees the calibration set alone, and assumes that the posterior is about Gaussian.
-    It says what the labels are worth without a simulator: a method that uses one and
-    does worse is not worth its simulations.
 
     References:
         | Addressing Misspecification in Simulation-based Inference through Data-driven
@@ -153,7 +144,12 @@ class CalibrationMLP(Method):
         theta, x = self._data.calibration
         split = split_pairs(theta, self.training.validation_fraction)
         train, held_out = split
-        estimator = self._gaussian(theta[train].cpu(), x[train].cpu()).to(self._device)
+        seen = x[train].cpu()
+        embedding = embedding_of(self._build(theta[train].cpu(), seen))
+        leave_out_constants(embedding)
+        net = embedding_with_head(embedding, 2 * theta.shape[1], seen)
+        mean, std = self._prior.mean.cpu(), self._prior.stddev.cpu()
+        estimator = DiagonalGaussian(net, mean, std, x.shape[1:]).to(self._device)
         history = fit_rows(
             estimator,
             lambda rows: estimator.loss(theta[rows], x[rows]).mean(),
@@ -168,10 +164,3 @@ class CalibrationMLP(Method):
             draws = self._prior.sample((NUM_DRAWS,))
         estimator.set_bounds(theta[unseen], x[unseen], draws)
         return direct_posterior(estimator, self._prior), history
-
-    def _gaussian(self, theta: Tensor, x: Tensor) -> DiagonalGaussian:
-        embedding = embedding_of(self._build(theta, x))
-        leave_out_constants(embedding)
-        net = embedding_with_head(embedding, 2 * theta.shape[1], x)
-        mean, std = self._prior.mean.cpu(), self._prior.stddev.cpu()
-        return DiagonalGaussian(net, mean, std, x.shape[1:])

@@ -12,14 +12,7 @@ from sbi_rope._prior import PriorDistribution
 from sbi_rope._random import seeded
 from sbi_rope._standardisation import ROUNDING
 
-__all__ = [
-    "Standardise",
-    "Unbounded",
-    "VelocityField",
-    "follow",
-    "follow_back",
-    "matching_loss",
-]
+__all__ = ["Standardise", "Unbounded", "VelocityField"]
 
 # Units of each layer, and residual blocks.
 HIDDEN, NUM_BLOCKS = 64, 5
@@ -61,53 +54,44 @@ class VelocityField(nn.Module):
             hidden = hidden + block(hidden)
         return self.last(hidden)
 
+    def loss(self, start: Tensor, end: Tensor, c: Tensor) -> Tensor:
+        r"""Return the loss of flow matching along straight paths, at random times.
 
-def matching_loss(
-    field: VelocityField, start: Tensor, end: Tensor, c: Tensor
-) -> Tensor:
-    r"""Return the loss of flow matching along straight paths, each at a random time.
+        .. math::
+            \bigl\lVert v\bigl((1 - (1 - \sigma) t) z_0 + t z_1,\, t,\, c\bigr)
+            - (z_1 - z_0) \bigr\rVert^2 / m, \qquad t \sim U(0, 1)
+        """
+        t = torch.rand_like(start[:, :1])
+        between = (1 - (1 - SIGMA) * t) * start + t * end
+        return (self(between, t, c) - (end - start)).square().mean()
 
-    .. math::
-        \bigl\lVert v\bigl((1 - (1 - \sigma) t) z_0 + t z_1,\, t,\, c\bigr)
-        - (z_1 - z_0) \bigr\rVert^2 / m, \qquad t \sim U(0, 1)
-    """
-    t = torch.rand_like(start[:, :1])
-    between = (1 - (1 - SIGMA) * t) * start + t * end
-    return (field(between, t, c) - (end - start)).square().mean()
+    def follow(self, z: Tensor, c: Tensor) -> Tensor:
+        """Carry points ``(n, m)`` along the field, from time 0 to 1."""
+        return _integrated(
+            lambda z, t: self(z, torch.full_like(z[:, :1], t), c), z, start=0.0, end=1.0
+        )
 
+    def follow_back(self, z: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
+        r"""Carry points ``(n, m)`` back, from time 1 to 0.
 
-def follow(field: VelocityField, z: Tensor, c: Tensor) -> Tensor:
-    """Carry points ``(n, m)`` along the field, from time 0 to 1."""
+        The second result is :math:`\int_0^1 \nabla \cdot v\, dt` along their ways.
+        """
 
-    def velocity(z: Tensor, t: float) -> Tensor:
-        return field(z, torch.full_like(z[:, :1], t), c)
+        def velocity(state: Tensor, t: float) -> Tensor:
+            z = state[:, :-1]
+            time = torch.full_like(z[:, :1], t)
+            v, divergence = torch.zeros_like(z), torch.zeros_like(time)
+            for k, direction in enumerate(torch.eye(z.shape[1]).to(z)):
+                moved: Any = torch.func.jvp(
+                    lambda z: self(z, time, c), (z,), (direction.expand_as(z),)
+                )
+                v, divergence = moved[0], divergence + moved[1][:, k : k + 1]
+            return torch.cat([v, divergence], dim=1)
 
-    return _integrated(velocity, z, start=0.0, end=1.0)
-
-
-def follow_back(field: VelocityField, z: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Carry points back, from time 1 to 0.
-
-    Returns:
-        The points, ``(n, m)``, and :math:`\int_0^1 \nabla \cdot v\, dt` along their
-        ways, ``(n,)``.
-    """
-
-    def velocity(state: Tensor, t: float) -> Tensor:
-        z = state[:, :-1]
-        time = torch.full_like(z[:, :1], t)
-        v, divergence = torch.zeros_like(z), torch.zeros_like(time)
-        for k, direction in enumerate(torch.eye(z.shape[1]).to(z)):
-            moved: Any = torch.func.jvp(
-                lambda z: field(z, time, c), (z,), (direction.expand_as(z),)
-            )
-            v, divergence = moved[0], divergence + moved[1][:, k : k + 1]
-        return torch.cat([v, divergence], dim=1)
-
-    state = torch.cat([z, torch.zeros_like(z[:, :1])], dim=1)
-    state = _integrated(velocity, state, start=1.0, end=0.0)
-    # The way back has summed it with the opposite sign.
-    return state[:, :-1], -state[:, -1]
+        state = torch.cat([z, torch.zeros_like(z[:, :1])], dim=1)
+        state = _integrated(velocity, state, start=1.0, end=0.0)
+        # The way back has summed it with the opposite sign.
+        return state[:, :-1], -state[:, -1]
 
 
 def _integrated(

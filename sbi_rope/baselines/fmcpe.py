@@ -10,14 +10,7 @@ from torch.distributions import Distribution
 from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalDensityEstimator, direct_posterior, embed
 from sbi_rope._standardisation import warn_of_far_entries
-from sbi_rope.baselines.flow_matching import (
-    Standardise,
-    Unbounded,
-    VelocityField,
-    follow,
-    follow_back,
-    matching_loss,
-)
+from sbi_rope.baselines.flow_matching import Standardise, Unbounded, VelocityField
 from sbi_rope.baselines.networks import fit_rows, fresh_copy
 from sbi_rope.baselines.statistics import OverDraws, frozen_statistics
 from sbi_rope.data import split_pairs
@@ -144,7 +137,31 @@ class FMCPE(Method):
         pushed = PushedForward(
             to_simulations, self._prior, self._field(x, seen_in, h, size=theta.shape[1])
         ).to(self._device)
-        history = self._train(pushed, bank, show_progress_bars=show_progress_bars)
+        u = pushed.unbounded.transformed(theta)
+
+        def loss(rows: Tensor) -> Tensor:
+            some = torch.randint(bank.shape[1], (len(rows),)).to(bank.device)
+            of_simulations, z = to_simulations.field_loss(x[rows], bank[rows, some])
+            of_theta = pushed.field_loss(x[rows], z, u[rows])
+            return 0.5 * of_simulations + 0.5 * of_theta
+
+        def held_out_loss(rows: Tensor) -> Tensor:
+            # The same noise for all epochs, so that they can be compared.
+            with seeded(0):
+                return loss(rows.repeat(-(-NUM_HELD_OUT // len(rows))))
+
+        history = fit_rows(
+            nn.ModuleList([to_simulations.field, pushed.field]),
+            loss,
+            split_pairs(theta, self.training.validation_fraction),
+            self.training,
+            validation_loss=held_out_loss,
+            pairs=theta,
+            decay=True,
+            in_training_mode=False,
+            label="FMCPE",
+            show_progress_bars=show_progress_bars,
+        )
         return direct_posterior(pushed, self._prior), history
 
     def _field(
@@ -159,37 +176,6 @@ class FMCPE(Method):
         else:
             condition = nn.Sequential(nn.Flatten(), unit)
         return VelocityField(size, condition, embed(condition, x[:1]).shape[1]).to(x)
-
-    def _train(
-        self, pushed: "PushedForward", bank: Tensor, *, show_progress_bars: bool
-    ) -> History:
-        theta, x = self._data.calibration
-        u, base = pushed.unbounded.transformed(theta), pushed.base
-        split = split_pairs(theta, self.training.validation_fraction)
-
-        def loss(rows: Tensor) -> Tensor:
-            some = torch.randint(bank.shape[1], (len(rows),)).to(bank.device)
-            of_simulations, z = base.field_loss(x[rows], bank[rows, some])
-            of_theta = pushed.field_loss(x[rows], z, u[rows])
-            return 0.5 * of_simulations + 0.5 * of_theta
-
-        def held_out_loss(rows: Tensor) -> Tensor:
-            # The same noise for all epochs, so that they can be compared.
-            with seeded(0):
-                return loss(rows.repeat(-(-NUM_HELD_OUT // len(rows))))
-
-        return fit_rows(
-            nn.ModuleList([base.field, pushed.field]),
-            loss,
-            split,
-            self.training,
-            validation_loss=held_out_loss,
-            pairs=theta,
-            decay=True,
-            in_training_mode=False,
-            label="FMCPE",
-            show_progress_bars=show_progress_bars,
-        )
 
 
 class ToSimulations(OverDraws):
@@ -233,9 +219,9 @@ class ToSimulations(OverDraws):
         """
         end, c = self.unit(simulated), self.field.condition(x_o)
         start, other = (self._start(x_o, torch.randn_like(end)) for _ in range(2))
-        loss = matching_loss(self.field, start, end, c)
+        loss = self.field.loss(start, end, c)
         with torch.no_grad():
-            return loss, self._embedded(follow(self.field, other, c))
+            return loss, self._embedded(self.field.follow(other, c))
 
     @torch.no_grad()
     def embed(self, x: Tensor) -> Tensor:
@@ -245,7 +231,7 @@ class ToSimulations(OverDraws):
             rows = some.repeat_interleave(count, dim=0)
             start = self._start(rows, self.xi.repeat(len(some), 1))
             c = self.field.condition(some).repeat_interleave(count, dim=0)
-            z = self._embedded(follow(self.field, start, c))
+            z = self._embedded(self.field.follow(start, c))
             parts.append(z.unflatten(0, (len(some), count)))
         return torch.cat(parts)
 
@@ -281,7 +267,7 @@ class PushedForward(Density):
         """Return the loss of the field, from draws of q at embeddings to ends in u."""
         with torch.no_grad():
             start = self._started(self.base.densities.answer(drawn, z))
-        return matching_loss(self.field, start, end, self.field.condition(x_o))
+        return self.field.loss(start, end, self.field.condition(x_o))
 
     def _started(self, theta: Tensor) -> Tensor:
         """Return u of draws; the prior replaces those outside its support."""
@@ -300,7 +286,7 @@ class PushedForward(Density):
         prior, unbounded = self.unbounded.prior, self.unbounded
         safe, inside = prior.moved_inside(theta.flatten(0, 1))
         u_end = unbounded.transformed(safe)
-        u, divergence = follow_back(self.field, u_end, c.repeat(len(theta), 1))
+        u, divergence = self.field.follow_back(u_end, c.repeat(len(theta), 1))
         start = unbounded.inverse(u).reshape(theta.shape)
         log_q = self.base.log_q(start, of_base)
         log_prior = prior.log_prob(start)
@@ -316,4 +302,4 @@ class PushedForward(Density):
         """Draw once for each of n numbers of observations, ``(n, d)``."""
         of_base, c = z
         start = self._started(self.base.draw(of_base, row))
-        return self.unbounded.inverse(follow(self.field, start, c[row]))
+        return self.unbounded.inverse(self.field.follow(start, c[row]))

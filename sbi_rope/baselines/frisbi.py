@@ -123,23 +123,14 @@ class FRISBI(Method):
             self._data.observations.shape[1:],
             self.gamma,
         )
-        history = self._train(aligned, z, show_progress_bars=show_progress_bars)
-        found: Density = aligned.eval()
-        if self.distilled:
-            found = self._distilled(aligned, show_progress_bars=show_progress_bars)
-        return MixturePosterior(found, self._prior), history
-
-    def _train(
-        self, aligned: "Aligned", targets: Tensor, *, show_progress_bars: bool
-    ) -> History:
         theta, x = self._data.calibration
         x_o = self._data.observations
         train, held_out = split_pairs(theta, self.training.validation_fraction)
 
         def error(pairs: Tensor) -> Tensor:
-            return (aligned.g(x[pairs]) - targets[pairs]).square().mean()
+            return (aligned.g(x[pairs]) - z[pairs]).square().mean()
 
-        return fit_rows(
+        history = fit_rows(
             aligned.g,
             lambda rows: error(train) + aligned.transport_cost(x_o[rows]),
             (torch.arange(len(x_o)), held_out),
@@ -150,6 +141,10 @@ class FRISBI(Method):
             label="FRISBI",
             show_progress_bars=show_progress_bars,
         )
+        found: Density = aligned.eval()
+        if self.distilled:
+            found = self._distilled(aligned, show_progress_bars=show_progress_bars)
+        return MixturePosterior(found, self._prior), history
 
     def _distilled(self, aligned: "Aligned", *, show_progress_bars: bool) -> Flow:
         """Return a density given g(x) that is trained on draws of the mixture."""
