@@ -170,28 +170,3 @@ def test_the_volume_of_the_transform_is_right_far_from_its_middle() -> None:
         torch.testing.assert_close(
             unbounded.log_scale(u).double(), expected.double(), atol=1e-3, rtol=1e-4
         )
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize("space", ["input", "embedding"])
-def test_fields_see_observations_in_their_own_unit_however_far_they_are(
-    space: str,
-) -> None:
-    torch.manual_seed(0)
-    npe = problems.npe_posterior("mdn", "none", dim=1)
-    theta = problems.box(1).sample((40,))
-    x = 30.0 + 7.0 * problems.simulate(theta)
-    method = FMCPE.from_posterior(
-        npe,
-        simulator=problems.simulate,
-        space=space,  # type: ignore[arg-type]
-        training=Training(max_num_epochs=1),
-    )
-    method.append_calibration(theta, x)
-    estimator = method.train(**QUIET).build_posterior().posterior_estimator
-    fields = [m for m in estimator.modules() if isinstance(m, VelocityField)]
-    assert len(fields) == 2
-    for field in fields:
-        seen = field.condition(x)
-        assert torch.allclose(seen.mean(dim=0), torch.zeros(3), atol=1e-3)
-        assert torch.allclose(seen.std(dim=0), torch.ones(3), atol=1e-3)

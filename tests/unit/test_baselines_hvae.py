@@ -2,12 +2,11 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
-from sbi.inference import NPE, DirectPosterior
+from sbi.inference import NPE
 from sbi.neural_nets import posterior_nn
 from sbi.utils import BoxUniform
 from torch import Tensor, nn
@@ -21,9 +20,9 @@ from sbi_rope.baselines.hvae_model import (
     HybridVAE,
     reparametrised_sample,
 )
-from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.pendulum import PendulumSimulator
-from sbi_rope.trainers.training import Training
+from sbi_rope.trainers import Training
+from tests.baselines import swing
 
 # --- a linear-Gaussian model whose evidence is known ---
 # theta ~ N(0, I_2), z ~ N(0, 1), x = A theta + B z + noise of standard deviation 0.5.
@@ -236,27 +235,16 @@ def test_density_is_the_mean_over_all_draws_of_the_latent(
 # --- the networks ---
 
 
-def unet(*event: int, mean: float = 0.0, std: float = 1.0) -> ConditionalUNet:
-    torch.manual_seed(0)
-    data = torch.randn(100, *event)
-    data = (data - data.mean()) / data.std()
-    return ConditionalUNet(mean + std * data, 5, width=4)
-
-
-def trained_like(net: nn.Module) -> nn.Module:
-    """Give every parameter a value; few ReLUs are shut then."""
-    torch.manual_seed(0)
-    for parameter in net.parameters():
-        if not parameter.any():
-            nn.init.uniform_(parameter, 0.1, 0.5)
-    return net.eval()
-
-
 @pytest.mark.parametrize("event", [(50,), (3, 20, 33)])
 def test_several_latents_of_one_x_are_the_same_as_one_at_a_time(
     event: tuple[int, ...],
 ) -> None:
-    net = trained_like(unet(*event)).double()
+    torch.manual_seed(0)
+    net = ConditionalUNet(torch.randn(100, *event), 5, width=4)
+    for parameter in net.parameters():
+        if not parameter.any():  # as after a training; few ReLUs are shut
+            nn.init.uniform_(parameter, 0.1, 0.5)
+    net = net.eval().double()
     x, z = torch.randn(3, *event).double(), torch.randn(3 * 4, 5).double()
     together = net(x, z)
     for i in range(12):
@@ -279,59 +267,14 @@ def test_the_net_starts_as_the_identity_at_the_variance_of_the_data() -> None:
     torch.testing.assert_close(law.stddev[0, :, 0, 0], std)
 
 
-def test_outputs_follow_the_units_of_the_data() -> None:
-    x, z = torch.randn(3, 40), torch.randn(3, 5)
-    law = trained_like(unet(40))(x, z)
-    scaled = trained_like(unet(40, mean=5.0, std=10.0))(5.0 + 10.0 * x, z)
-    torch.testing.assert_close(scaled.mean, 5.0 + 10.0 * law.mean, atol=1e-3, rtol=0)
-    torch.testing.assert_close(scaled.stddev, 10.0 * law.stddev, atol=0, rtol=1e-3)
-
-
 # --- the method ---
 
-
-def physics(theta: Tensor) -> Tensor:
-    zero = torch.zeros_like(theta[:, :1])
-    return PendulumSimulator().position(theta, phase=zero, damping=zero)
-
-
 PRIOR = BoxUniform(torch.tensor([0.0, 0.5]), torch.tensor([3.0, 10.0]))
-SMALL = Training(
-    training_batch_size=50,
-    learning_rate=1e-3,
-    validation_fraction=0.2,
-    max_num_epochs=2,
-)
 
 
-def real(n: int, *, seed: int) -> tuple[Tensor, Tensor]:
-    torch.manual_seed(seed)
+def real(n: int) -> tuple[Tensor, Tensor]:
     theta = PRIOR.sample((n,))
     return theta, PendulumSimulator(max_damping=1.0)(theta)
-
-
-@pytest.fixture(scope="module")
-def npe() -> DirectPosterior:
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        theta = PRIOR.sample((2000,))
-        builder = posterior_nn(
-            "maf",
-            embedding_net=nn.Sequential(
-                nn.Linear(200, 32), nn.ReLU(), nn.Linear(32, 32), nn.ReLU()
-            ),
-            z_score_x="structured",
-            num_transforms=2,
-        )
-        trainer = NPE(PRIOR, density_estimator=builder, show_progress_bars=False)
-        trainer.append_simulations(theta, PendulumSimulator()(theta))
-        trainer.train(max_num_epochs=10, training_batch_size=100, learning_rate=2e-3)
-        return trainer.build_posterior()
-
-
-def small(npe: Any, **options: Any) -> HVAE:
-    options = {"physics": physics, "width": 2, "training": SMALL, **options}
-    return HVAE.from_posterior(npe, **options)
 
 
 def scores(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
@@ -339,14 +282,27 @@ def scores(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
 
 
 @pytest.mark.slow
-def test_training_improves_on_npe_for_held_out_real_data_and_leaves_npe_alone(
-    npe: Any,
-) -> None:
-    method = small(npe, training=replace(SMALL, learning_rate=3e-3, max_num_epochs=10))
-    method.append_calibration(*real(200, seed=1))
-    method.append_observations(real(60, seed=2)[1])
+def test_training_improves_on_npe_for_held_out_real_data_and_leaves_npe_alone() -> None:
+    torch.manual_seed(0)
+    theta = PRIOR.sample((2000,))
+    net = nn.Sequential(nn.Linear(200, 32), nn.ReLU(), nn.Linear(32, 32), nn.ReLU())
+    builder = posterior_nn(
+        "maf", embedding_net=net, z_score_x="structured", num_transforms=2
+    )
+    trainer = NPE(PRIOR, density_estimator=builder, show_progress_bars=False)
+    trainer.append_simulations(theta, PendulumSimulator()(theta))
+    trainer.train(max_num_epochs=10, training_batch_size=100, learning_rate=2e-3)
+    npe = trainer.build_posterior()
+    training = Training(
+        training_batch_size=50,
+        learning_rate=3e-3,
+        validation_fraction=0.2,
+        max_num_epochs=10,
+    )
+    method = HVAE.from_posterior(npe, physics=swing, width=2, training=training)
+    method.append_calibration(*real(200)).append_observations(real(60)[1])
     posterior = method.train(seed=0, show_progress_bars=False).build_posterior()
-    theta, x = real(300, seed=3)
+    theta, x = real(300)
     gain = scores(posterior, theta, x) - scores(npe, theta, x)
     standard_error = float(gain.std()) / math.sqrt(len(gain))
     assert float(gain.mean()) > 3 * standard_error
@@ -361,44 +317,3 @@ def test_training_improves_on_npe_for_held_out_real_data_and_leaves_npe_alone(
         estimator.nets.member(0).parameters(), net.parameters(), strict=True
     ):
         assert torch.equal(own, given)
-
-
-@pytest.mark.medium
-def test_images_are_supported() -> None:
-    prior = BoxUniform(torch.zeros(3), torch.ones(3))
-
-    def picture(theta: Tensor) -> Tensor:
-        square = torch.zeros(20, 17)
-        square[5:12, 3:9] = 1.0
-        return theta[:, :, None, None] * square
-
-    net = nn.Sequential(nn.AvgPool2d(4), nn.Flatten(), nn.LazyLinear(8))
-    net(torch.zeros(1, 3, 20, 17))
-    method = HVAE(
-        prior,
-        posterior_nn("maf", embedding_net=net, num_transforms=1, z_score_x="none"),
-        physics=picture,
-        npe_training=Training(max_num_epochs=1),
-        training=SMALL,
-        width=2,
-    )
-    theta = prior.sample((60,))
-    noise = 0.1 * torch.randn(60, 3, 20, 17)
-    method.append_simulations(theta, picture(theta) + noise)
-    method.append_calibration(theta[:10], 0.5 * picture(theta[:10]))
-    method.append_observations(0.5 * picture(theta[10:]))
-    posterior = method.train(seed=0, show_progress_bars=False).build_posterior()
-    x = 0.5 * picture(theta[:5])
-    assert torch.isfinite(scores(posterior, theta[:5], x)).all()
-    assert posterior.posterior_estimator.condition_shape == (3, 20, 17)
-
-
-# --- errors ---
-
-
-def test_physics_without_a_gradient_is_refused(npe: Any) -> None:
-    method = small(npe, physics=lambda theta: physics(theta).detach())
-    method.append_calibration(*real(10, seed=1))
-    method.append_observations(real(10, seed=2)[1])
-    with pytest.raises(InvalidInputError, match="differentiable"):
-        method.train(seed=0)

@@ -171,29 +171,3 @@ def test_batch_statistics_are_those_of_the_simulations() -> None:
     (norm,) = [m for m in embedding.modules() if isinstance(m, nn.BatchNorm1d)]
     assert norm.running_mean.abs().max() < 0.3
     assert norm.num_batches_tracked >= 14
-
-
-class Recorder(nn.Linear):
-    """A linear embedding that remembers what passes through it for the penalty."""
-
-    seen: list[Tensor] = []  # noqa: RUF012
-
-    def forward(self, x: Tensor) -> Tensor:
-        # One row at a time comes only from sbi, which tries the net when it builds.
-        if torch.is_grad_enabled() and not self.training and len(x) > 1:
-            self.seen.append(x.detach())
-        return super().forward(x)
-
-
-@pytest.mark.medium
-def test_each_step_draws_anew_from_all_simulations_and_observations(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("sbi_rope.baselines.npe_rs.NUM_ROWS", 30)
-    Recorder.seen.clear()
-    training = Training(training_batch_size=10, max_num_epochs=10)
-    trained(net=Recorder(2, 2), training=training)
-    assert len(Recorder.seen) == 2 * 10 * 9
-    for steps, total in [(Recorder.seen[::2], 100), (Recorder.seen[1::2], 200)]:
-        assert all(len(step.unique(dim=0)) == len(step) == 30 for step in steps)
-        assert len(torch.cat(steps).unique(dim=0)) == total
