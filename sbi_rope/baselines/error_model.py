@@ -79,20 +79,13 @@ def denoise(
     .. math::
         p(s \mid y) \propto q(s)\, p(y \mid s)
 
-    by slice sampling of :math:`z = \operatorname{asinh}((y - s) / \sigma)`. In z spike
-    and slab are about equally wide, so that brackets of one width cross from one to the
-    other, where in s they differ by orders of magnitude. One chain starts at y, the
-    others at the simulations to which the error model gives the largest density.
+    by slice sampling of :math:`z = \operatorname{asinh}((y - s) / \sigma)`, in which
+    spike and slab are about equally wide. One chain starts at y, the others at the
+    simulations to which the error model gives the largest density.
 
-    Args:
-        y: Standardised real statistics, shape ``(n, l)``.
-        log_density: :math:`\log q` of statistics, ``(m, l)`` to ``(m,)``.
-        simulated: Standardised simulated statistics, shape ``(n_s, l)``.
-        error_model: :math:`p(y \mid s)`, with :math:`\sigma` its ``spike_std``.
-        num_draws: Draws of each observation, of all its chains together.
-        num_chains: Chains of each observation.
-        warmup: Sweeps that each chain starts with and that are thrown away.
-        thin: Sweeps for every draw kept.
+    Standardised real statistics y are ``(n, l)``, simulated ones ``(n_s, l)``. Each
+    observation has ``num_draws`` draws from several chains, of which the first
+    ``warmup`` sweeps are thrown away and then all but every ``thin``-th.
 
     Returns:
         Draws of s, shape ``(n, num_draws, l)``, and the largest split-R-hat of the

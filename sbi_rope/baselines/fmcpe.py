@@ -59,9 +59,8 @@ class FMCPE(Method):
     along the way of theta back to :math:`\theta_0`. The noise :math:`\xi_k`, K = 100,
     is drawn once and is the same for all observations.
 
-    It sees simulations and the calibration set, and simulates at the calibration
-    parameters. It assumes little about what is wrong, and has to learn all of it from
-    the pairs, which takes hundreds of them.
+    It sees simulations and the calibration set. It assumes little about what is wrong,
+    and has to learn all of it from the pairs, which takes hundreds of them.
 
     References:
         | Flow Matching for Robust Simulation-Based Inference under Model
@@ -185,8 +184,8 @@ class ToSimulations(OverDraws):
         \tfrac1K \sum_k q(\theta \mid s_k), \qquad
         s_k = h\bigl(T_x(x_o + \epsilon\, \xi_k;\, x_o)\bigr)
 
-    What is mapped are ``statistics`` of an observation, in a ``unit``: the observation
-    itself, or its embedding; the net h follows. The shapes are those of both.
+    What is mapped, in a unit, are ``statistics`` of an observation: itself, or its
+    embedding. The shapes are those of both.
     """
 
     xi: Tensor

@@ -58,9 +58,8 @@ class FRISBI(Method):
 
     It sees simulations, the calibration set and observations without parameters. Each
     row of the coupling is independent of the others: it is RoPE's with tau = 0, which
-    does not trust the prior, and it answers for any x. The second term has a minimum
-    wherever observations are on top of simulations, whichever these are, so that it
-    assumes that g starts near the right ones.
+    does not trust the prior, and it answers for any x. It assumes that g starts near
+    the right simulations: the second term is small near any of them.
 
     References:
         | Inductive Domain Transfer in Misspecified Simulation-Based Inference (Senouf

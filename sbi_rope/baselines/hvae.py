@@ -48,15 +48,12 @@ class HVAE(Method):
     Inference: :math:`z \sim q(z \mid x_o)`, a simulation like the observation,
     :math:`\tilde x = \mathrm{R2P}(x_o, z)`, and :math:`\theta \sim q(\theta \mid
     h(\tilde x))` by NPE, which stays as it is. Explanation: the deterministic physics
-    :math:`f(\theta)`, to which P2R adds with z what it lacks. P2R and R2P are U-Nets
-    whose means are their inputs plus what they learn, and the mean of R2P is taken;
-    :math:`q(z \mid x_o)` is an embedding net like that of NPE, untrained, with a linear
-    layer. An observation has m entries. The posterior mixes :math:`q(\theta \mid
-    h(\tilde x))` over 64 draws of z whose noise is fixed.
+    :math:`f(\theta)`, to which P2R adds with z what it lacks. P2R and R2P are U-Nets;
+    :math:`q(z \mid x_o)` is an untrained embedding net with a linear layer. An
+    observation has m entries. The posterior mixes :math:`q(\theta \mid h(\tilde x))`
+    over 64 draws of z. The epoch that is best on held-out pairs is kept.
 
-    It sees simulations, the calibration set and observations without parameters. Their
-    means and standard deviations scale the data; a part of the pairs is held out, and
-    the epoch with the largest log-probability on them is kept, the start included. It
+    It sees simulations, the calibration set and observations without parameters. It
     assumes series or images, a simulator that can be differentiated once its noise is
     left out, and a prior on a box, whose sides may be infinite. The densities stay as
     narrow as those of NPE.

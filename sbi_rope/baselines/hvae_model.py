@@ -29,16 +29,9 @@ class HybridVAE(nn.Module):
     r"""Real observations as physics seen through a network with a latent vector.
 
     The model is :math:`\theta \sim p(\theta)`, :math:`z \sim \mathcal{N}(0, I)` and
-    :math:`x_o \sim \mathcal{N}(\mu, \operatorname{diag} \sigma^2)` with
-    :math:`\mu, \sigma = \mathrm{P2R}(f(\theta), z)`, where f is deterministic physics.
-    Its approximate posterior is
-
-    .. math::
-        z \sim q(z \mid x_o), \quad \theta \sim q(\theta \mid h(\tilde x_s)), \quad
-        \tilde x_s = \mathrm{R2P}(x_o, z),
-
-    the second one a frozen NPE. Each network returns a Gaussian; of that of R2P the
-    mean is taken. The physics maps theta ``(n, d)`` to ``(n, *event)``.
+    :math:`x_o \sim \mathrm{P2R}(f(\theta), z)`; its approximate posterior, that of
+    :class:`~sbi_rope.baselines.HVAE`. Each network returns a Gaussian; of that of R2P
+    the mean is taken.
     """
 
     def __init__(
@@ -116,8 +109,8 @@ class ContinuedPrior:
         \log \tilde p(\theta) = \log p(\bar\theta)
         - \sum_k \frac{|\theta_k - \bar\theta_k|}{0.1\, s_k}.
 
-    A flow puts some of its mass outside of the support. There the ELBO would be minus
-    infinity and without a gradient; this one is finite and leads back inside.
+    A flow has some mass outside of the support, where the ELBO would be minus infinity.
+    This one is finite, and its gradient leads back inside.
     """
 
     def __init__(self, prior: Distribution) -> None:
@@ -158,33 +151,24 @@ def reparametrised_sample(flow: Any, condition: Tensor) -> Tensor:
         torch.autograd.grad(entry.sum(), point, retain_graph=True)[0]
         for entry in noise.unbind(dim=1)
     ]
-    # Zero, but for its gradient.
-    difference = (noise - noise.detach()).unsqueeze(2)
-    return (
-        theta.detach()
-        - torch.linalg.solve(torch.stack(rows, dim=1), difference)[..., 0]
-    )
+    zero = noise - noise.detach()  # but for its gradient
+    step = torch.linalg.solve(torch.stack(rows, dim=1), zero.unsqueeze(2))
+    return theta.detach() - step.squeeze(2)
 
 
 class ConditionalUNet(nn.Module):
     r"""A U-Net from a series or image and a latent vector to a Gaussian over the same.
 
-    Five blocks of two convolutions with 1, 2, 4, 8 and 16 times ``width`` channels and
-    maxima over neighbours between them; the latent vector joins the last as constant
-    channels; four up-convolutions follow, each with a block that also sees the block of
-    its size on the way down. The mean is the input plus the output of the network,
-    which starts at zero.
-
-    Data are standardised inside, with one mean and one standard deviation a channel, so
-    that pixels that never change do no harm, and padded with their last values to
-    multiples of 16. In standardised units log-variances are :math:`10 \tanh(v / 10)`.
+    Five blocks of two convolutions with 1, 2, 4, 8 and 16 times ``width`` channels; the
+    latent vector joins the last as constant channels; four up-convolutions follow, each
+    with a block that also sees the block of its size on the way down. The mean is the
+    input plus the output, which starts at zero. Each channel of the data, ``(n,
+    length)`` or ``(n, channels, height, width)``, is standardised inside.
 
     References:
         | U-Net: Convolutional Networks for Biomedical Image Segmentation (Ronneberger
           et al., 2015)
         | https://arxiv.org/abs/1505.04597
-
-    The data are series, ``(n, length)``, or images, ``(n, channels, height, width)``.
     """
 
     mean: Tensor

@@ -26,10 +26,9 @@ class NNPE(Method):
         + \tfrac12 \mathrm{Cauchy}(0, 0.25)
 
     in units of each statistic's standard deviation over the simulations. The statistics
-    are the embedding h(x) of NPE, which is kept as it is while the density is trained
-    on, or, where x is a list of statistics itself, its entries; then the embedding net
-    is trained on too. Training starts from NPE, and the noise is drawn anew for every
-    batch. A real observation is conditioned on directly.
+    are the embedding h(x) of NPE, which is kept as it is, or the entries of x; then the
+    embedding net is trained on too. Training starts from NPE, and the noise is drawn
+    anew for every batch. A real observation is conditioned on directly.
 
     It sees simulations, also when it starts from a trained NPE. It assumes that
     statistics err independently of each other, any of them, and by a few standard

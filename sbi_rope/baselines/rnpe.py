@@ -123,17 +123,14 @@ class RNPE(Method):
         + \tfrac12 \mathrm{Cauchy}(y_d; s_d, 0.25)\bigr]
 
     in units of each statistic's standard deviation over the simulations. The density
-    q(s) of simulated statistics is a neural spline flow. For every observation,
-    statistics are drawn by sbi's slice sampler, with the choice between spike and slab
-    summed out, and kept with the posterior. Chains that disagree are warned of, and
+    q(s) is a neural spline flow. For every observation, statistics are drawn by sbi's
+    slice sampler and kept with the posterior. Chains that disagree are warned of, and
     ``posterior.posterior_estimator.r_hat(x)`` tells by how much.
 
     It sees simulations. It assumes that statistics err independently of each other, any
-    of them, and that simulated ones are not tied to each other: a sweep moves one at a
-    time, so that chains are slow on strongly correlated statistics and slower on an
-    embedding with more outputs than x has informative entries. Prefer it to NNPE with a
-    few statistics, each with a meaning, and ``noise_on="input"``; elsewhere NNPE has no
-    chains that could fail.
+    of them. A sweep moves one statistic at a time, so that chains are slow on strongly
+    correlated ones. Prefer it to NNPE with a few statistics, each with a meaning, and
+    ``noise_on="input"``.
 
     References:
         | Robust Neural Posterior Estimation and Statistical Model Criticism

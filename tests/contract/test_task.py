@@ -121,7 +121,7 @@ def test_density_spread_and_quantiles_of_the_prior_are_those_of_its_draws(
 
 ALPHA = [0.5, 0.1]  # with the density of Malus' law at uniform angles
 ANALYTIC: dict[str, tuple[list[list[float]], list[float]]] = {
-    "cs": ([[850.0, 11.5, 20.0]], [-math.log(1300 * 17 * 10)]),
+    "cs": ([[850.0, 11.5, 15.0]], [-math.log(1300 * 17 * 10)]),
     "light_tunnel": (
         [[0.0, 254.0, 100.0, ALPHA[0]], [1.0, 2.0, 3.0, ALPHA[1]]],
         [-3 * math.log(255) - math.log(math.pi * (a - a * a) ** 0.5) for a in ALPHA],
