@@ -150,10 +150,10 @@ class Unbounded(nn.Module):
 
     def __init__(self, prior: Distribution) -> None:
         super().__init__()
-        self.prior = PriorDistribution(prior)
+        self._prior = PriorDistribution(prior)
         with seeded(0):
-            draws = self.prior.sample((NUM_DRAWS,))
-        low, high = self.prior.bounds(draws[0])
+            draws = self._prior.sample((NUM_DRAWS,))
+        low, high = self._prior.bounds(draws[0])
         # Where only one bound is known, the range is that of a uniform distribution
         # with the same standard deviation.
         margin = MARGIN * 12**0.5 * draws.std(dim=0)
@@ -162,11 +162,15 @@ class Unbounded(nn.Module):
         self.unit = Standardise(self._transform(self._off_bounds(draws)))
 
     @property
+    def prior(self) -> PriorDistribution:
+        """The prior, where the parameters are: it is no module that could be moved."""
+        self._prior.to(self.low.device)
+        return self._prior
+
+    @property
     def _transform(self) -> Any:
-        device = self.low.device
-        self.prior.to(device)
         with seeded(0):  # sbi draws from the prior to look at it
-            return mcmc_transform(self.prior, device=str(device))
+            return mcmc_transform(self.prior, device=str(self.low.device))
 
     def _off_bounds(self, theta: Tensor) -> Tensor:
         return theta.maximum(self.low.to(theta)).minimum(self.high.to(theta))

@@ -139,7 +139,7 @@ class FMCPE(Method):
         u = pushed.unbounded.transformed(theta)
 
         def loss(rows: Tensor) -> Tensor:
-            some = torch.randint(bank.shape[1], (len(rows),)).to(bank.device)
+            some = torch.randint(bank.shape[1], (len(rows),))
             of_simulations, z = to_simulations.field_loss(x[rows], bank[rows, some])
             of_theta = pushed.field_loss(x[rows], z, u[rows])
             return 0.5 * of_simulations + 0.5 * of_theta

@@ -226,18 +226,6 @@ def source(*, stored: bool) -> dict[str, Any]:
     return {"simulator": TASK.get_simulator()}
 
 
-def test_each_parameter_of_the_reference_has_a_simulation_of_its_own() -> None:
-    theta, simulator = TASK.get_test_set(2000)[0], TASK.get_simulator()
-    method = ReferenceNPE(TASK.get_prior(), builder())
-    kept, x = method.append_simulations(*simulations()).simulated_test_set(
-        theta, simulator
-    )
-    assert torch.equal(kept, theta)
-    noise = x - theta @ simulator.matrix(theta).T
-    assert float(noise.mean()) == pytest.approx(0, abs=0.05)
-    assert float(noise.std()) == pytest.approx(TASK.noise_std, rel=0.05)
-
-
 @pytest.mark.parametrize("family", ["fmpe", "npse"])
 def test_npe_given_beforehand_may_be_a_vector_field(family: str) -> None:
     posterior = problems.vector_field_posterior(family)
