@@ -158,11 +158,8 @@ def _coupled(rope: RoPE, case: Case, cell: Cell) -> Any:
 
 def _trained_rope(case: Case) -> RoPE:
     """Return what couples in RoPE and OT-only, trained as far as it is."""
-    build = METHODS[case.cell.method].build
-    if build is not None:
-        method: Any = build(case)
-        append_data(method, case.cell.method, case)
-        return method.build_rope()
+    if not METHODS[case.cell.method].pairs:
+        return _rope_of(case)
     rope = _rope_of(case).append_calibration(*case.calibration)
     return rope.train(seed=case.seed, show_progress_bars=False)
 

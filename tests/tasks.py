@@ -10,20 +10,6 @@ from torch import Tensor
 from sbi_rope.tasks import Task, get_task
 from tests.conftest import SHARED_DATA, TEST_DATA
 
-__all__ = [
-    "MEASURED",
-    "ROOTS",
-    "SUBTLE",
-    "all_recorded",
-    "as_many",
-    "draw",
-    "largest_z",
-    "make",
-    "rows_of",
-    "same_rows",
-    "skip_without_data",
-]
-
 # Their parameters were measured, and none was set. The repository has no data of them.
 MEASURED = ("near_infrared", "ocean_colour")
 # Folders with the recorded data of tasks; the other tasks are drawn here.

@@ -5,6 +5,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.distributions import Independent, Normal
 
 from sbi_rope._random import seeded
 from sbi_rope._sbi import (
@@ -13,25 +14,16 @@ from sbi_rope._sbi import (
     embedding_of,
     leave_out_constants,
 )
-from sbi_rope.baselines.networks import embedding_with_head
+from sbi_rope.baselines.networks import embedding_with_head, fit_rows
 from sbi_rope.data import split_pairs
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.fit import History, Training, fit_on_pairs
+from sbi_rope.fit import History, Training
 from sbi_rope.trainers.base import Method
-from sbi_rope.trainers.training import EstimatorBuilder, estimator_builder
 
 __all__ = ["CalibrationMLP", "DiagonalGaussian"]
 
-DEFAULT_TRAINING = Training(
-    training_batch_size=100,
-    learning_rate=3e-4,
-    validation_fraction=0.2,
-    stop_after_epochs=200,
-    max_num_epochs=2000,
-)
 # In standard deviations of the prior; a share of the held-out error; pairs.
 FARTHEST, FLOOR, PSEUDO_PAIRS = 5.0, 0.1, 2
-# Draws that stand in for the range of the prior, and for moments it does not know.
+# Draws that stand in for the range of the prior.
 NUM_DRAWS = 10_000
 
 
@@ -44,8 +36,7 @@ class DiagonalGaussian(ConditionalDensityEstimator):
         \qquad w = \frac{25 e^v}{25 + e^v}
 
     Mean and standard deviation stay within five standard deviations of the prior. The
-    floor f starts at zero, see :meth:`set_floor`, and the mean has no other bounds at
-    the start, see :meth:`set_range`.
+    floor f is zero until :meth:`set_bounds`.
 
     Args:
         net: Maps observations ``(n, *event)`` to means and log-variances ``(n, 2 d)``
@@ -71,52 +62,41 @@ class DiagonalGaussian(ConditionalDensityEstimator):
         self.register_buffer("lowest", torch.full_like(mean, -torch.inf))
         self.register_buffer("highest", torch.full_like(mean, torch.inf))
 
-    def set_range(self, theta: Tensor) -> None:
-        """Let no mean leave the range of draws from the prior.
-
-        An observation unlike those it was trained on can carry it out of the prior's
-        support, where no draw would ever be accepted.
-        """
-        self.lowest = theta.amin(dim=0).to(self.lowest)
-        self.highest = theta.amax(dim=0).to(self.highest)
-
     @torch.no_grad()
-    def set_floor(self, theta: Tensor, x: Tensor) -> None:
-        """Let no standard deviation fall below a tenth of the root mean square error.
+    def set_bounds(self, theta: Tensor, x: Tensor, draws: Tensor) -> None:
+        """Bound the mean by draws of the prior, and the deviation by the error.
 
         Far from what it was trained on, a network can be sure of something wrong
-        without bound. The pairs, ``(n, d)`` and ``(n, *event)``, it has not seen.
+        without bound, and its mean can leave the prior's support, where no draw would
+        ever be accepted. The pairs are those of the hold-out set.
         """
-        error = (theta - self._moments(x)[0]) / self.std
+        error = (theta - self.law(x).mean) / self.std
         # As if two more pairs were off by a standard deviation of the prior: a few
         # pairs can be met by chance.
         total = error.square().sum(dim=0) + PSEUDO_PAIRS
         self.floor = FLOOR * (total / (len(x) + PSEUDO_PAIRS)).sqrt()
+        self.lowest, self.highest = draws.amin(dim=0), draws.amax(dim=0)
 
-    def _moments(self, condition: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and log standard deviation of theta, each ``(B, d)``."""
-        mean, log_variance = self.net(condition).chunk(2, dim=-1)
-        mean = FARTHEST * torch.tanh(mean / FARTHEST)
-        log_variance = -torch.logaddexp(
-            -log_variance, torch.full_like(log_variance, -2 * math.log(FARTHEST))
-        )
+    def law(self, x: Tensor) -> Any:
+        """Return the Gaussians of observations ``(B, *event)``."""
+        mean, log_variance = self.net(x).chunk(2, dim=-1)
+        mean = self.mean + self.std * FARTHEST * torch.tanh(mean / FARTHEST)
+        most = torch.full_like(log_variance, 2 * math.log(FARTHEST))
+        log_variance = -torch.logaddexp(-log_variance, -most)
         log_variance = torch.logaddexp(log_variance, 2 * self.floor.log())
-        mean = (self.mean + self.std * mean).clamp(self.lowest, self.highest)
-        return mean, self.std.log() + 0.5 * log_variance
+        mean = mean.clamp(self.lowest, self.highest)
+        std = self.std * (0.5 * log_variance).exp()
+        return Independent(Normal(mean, std, validate_args=False), 1)
 
     def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
         """Return the log density, shape ``(S, B)`` or ``(B,)``."""
-        mean, log_std = self._moments(condition)
-        z = (input - mean) * torch.exp(-log_std)
-        return (-0.5 * z**2 - log_std - 0.5 * math.log(2 * math.pi)).sum(dim=-1)
+        return self.law(condition).log_prob(input)
 
     def sample(
         self, sample_shape: torch.Size, condition: Tensor, **kwargs: Any
     ) -> Tensor:
         """Draw parameters, shape ``(*sample_shape, B, d)``."""
-        mean, log_std = self._moments(condition)
-        noise = torch.randn(*sample_shape, *mean.shape).to(mean)
-        return mean + log_std.exp() * noise
+        return self.law(condition).sample(sample_shape)
 
     def loss(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
         """Return the negative log density, shape ``(B,)``."""
@@ -131,16 +111,11 @@ class CalibrationMLP(Method):
         \operatorname{diag} \sigma^2(x_{o,i})\bigr)
 
     The network is the embedding net of the density estimator, its parameters drawn
-    anew, with linear outputs for mean and log-variance; where the estimator has no
-    embedding net, one with two hidden layers of 64 units. Parameters are standardised
-    by the prior. A part of the pairs is held out and the best network on them is kept.
-    No standard deviation is below a tenth of the root mean square error on them, and no
-    mean is outside the range of the prior. Entries of x that are the same in all pairs
-    are left out.
+    anew, with linear outputs for mean and log-variance. Where the estimator has no
+    embedding net, it has two hidden layers of 64 units. The network that is best on a
+    hold-out set is kept. Entries of x that are the same in all pairs are left out.
 
-    Sees the calibration set alone. Assumes nothing of the simulator and that the
-    posterior is about Gaussian. Says what the labels are worth without a simulator: a
-    method that uses one and does worse is not worth its simulations.
+    It sees the calibration set alone, and assumes that the posterior is about Gaussian.
 
     References:
         | Addressing Misspecification in Simulation-based Inference through Data-driven
@@ -148,63 +123,44 @@ class CalibrationMLP(Method):
         | https://arxiv.org/abs/2405.08719
 
     Args:
-        prior: A torch distribution over parameters of shape ``(d,)``.
+        prior, device: See :class:`Method`.
         density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns; only its
             embedding net and its standardisation of x are used.
-        training: How it is trained; at most 2000 epochs in batches of 100 at a learning
-            rate of 3e-4, and 200 without improvement, if None.
-        device: Where to train; data on other devices is moved there.
-
-    Raises:
-        InvalidInputError: In ``train``, if there is one pair only.
+        training: At most 2000 epochs in batches of 100 at a learning rate of 3e-4, and
+            200 without improvement, if None.
     """
 
     sees = frozenset({"calibration"})
-
-    def __init__(
-        self,
-        prior: Any,
-        density_estimator: str | EstimatorBuilder = "nsf",
-        *,
-        training: Training | None = None,
-        device: str | torch.device = "cpu",
-    ) -> None:
-        super().__init__(prior, device=device)
-        self._build = estimator_builder(density_estimator)
-        self.training = training or DEFAULT_TRAINING
+    min_pairs = 2  # by which x is standardised
+    default_training = Training(
+        training_batch_size=100,
+        learning_rate=3e-4,
+        validation_fraction=0.2,
+        stop_after_epochs=200,
+        max_num_epochs=2000,
+    )
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         theta, x = self._data.calibration
-        if len(x) < 2:
-            raise InvalidInputError(
-                "Expected at least 2 calibration pairs, by which x is standardised; "
-                "got 1."
-            )
-        train, held_out = split_pairs(theta, self.training.validation_fraction)
-        estimator = self._gaussian(theta[train], x[train]).to(self._device)
-        history = fit_on_pairs(
+        split = split_pairs(theta, self.training.validation_fraction)
+        train, held_out = split
+        seen = x[train].cpu()
+        embedding = embedding_of(self._build(theta[train].cpu(), seen))
+        leave_out_constants(embedding)
+        net = embedding_with_head(embedding, 2 * theta.shape[1], seen)
+        mean, std = self._prior.mean.cpu(), self._prior.stddev.cpu()
+        estimator = DiagonalGaussian(net, mean, std, x.shape[1:]).to(self._device)
+        history = fit_rows(
             estimator,
-            theta,
-            x,
-            (train, held_out),
-            training=self.training,
-            in_training_mode=True,
+            lambda rows: estimator.loss(theta[rows], x[rows]).mean(),
+            split,
+            self.training,
+            pairs=theta,
             label="MLP",
             show_progress_bars=show_progress_bars,
         )
         unseen = held_out if len(held_out) else train
-        estimator.set_floor(theta[unseen], x[unseen])
-        estimator.set_range(self._prior_draws())
-        return direct_posterior(estimator, self._prior), history
-
-    def _gaussian(self, theta: Tensor, x: Tensor) -> DiagonalGaussian:
-        theta, x = theta.cpu(), x.cpu()
-        embedding = embedding_of(self._build(theta, x))
-        leave_out_constants(embedding)
-        net = embedding_with_head(embedding, 2 * theta.shape[1], x)
-        mean, std = self._prior.mean.cpu(), self._prior.stddev.cpu()
-        return DiagonalGaussian(net, mean, std, x.shape[1:])
-
-    def _prior_draws(self) -> Tensor:
         with seeded(0):
-            return self._prior.sample(torch.Size((NUM_DRAWS,)))
+            draws = self._prior.sample((NUM_DRAWS,))
+        estimator.set_bounds(theta[unseen], x[unseen], draws)
+        return direct_posterior(estimator, self._prior), history

@@ -11,12 +11,10 @@ from torch import Tensor
 from sbi_rope._sbi import SliceSamplerVectorized
 from sbi_rope.settings import Positive, Settings, UnitInterval
 
-__all__ = ["BOUND", "ChainSettings", "SpikeAndSlab", "denoise", "split_r_hat"]
+__all__ = ["BOUND", "SpikeAndSlab", "denoise", "split_r_hat"]
 
 # Draws of noise farther out are put here, since networks see them: 8e-5 of all.
 BOUND = 1e3
-# Observations whose chains run side by side; more of them gain nothing.
-GROUP_SIZE = 50
 # Widest bracket of the slice sampler; it also ends the search where a density is flat.
 MAX_WIDTH = 50.0
 
@@ -65,109 +63,76 @@ class SpikeAndSlab(Settings):
         return torch.logaddexp(spike + torch.log1p(-share), slab + share.log())
 
 
-@dataclass(frozen=True, kw_only=True)
-class ChainSettings:
-    """How the denoising posterior of each observation is sampled."""
-
-    num_draws: int
-    num_chains: int
-    warmup: int  # sweeps that each chain starts with and that are thrown away
-    thin: int  # sweeps for every draw kept
-
-
 def denoise(
     y: Tensor,
     *,
     log_density: Callable[[Tensor], Tensor],
     simulated: Tensor,
     error_model: SpikeAndSlab,
-    settings: ChainSettings,
+    num_draws: int,
+    num_chains: int,
+    warmup: int,
+    thin: int,
 ) -> tuple[Tensor, Tensor]:
     r"""Draw the statistics that a simulator may have had behind real ones.
 
     .. math::
         p(s \mid y) \propto q(s)\, p(y \mid s)
 
-    by slice sampling of :math:`z = \operatorname{asinh}((y - s) / \sigma)`. In z spike
-    and slab are about equally wide, so that brackets of one width cross from one to the
-    other, where in s they differ by orders of magnitude. One chain starts at y, the
-    others at the simulations to which the error model gives the largest density.
+    by slice sampling of :math:`z = \operatorname{asinh}((y - s) / \sigma)`, in which
+    spike and slab are about equally wide. One chain starts at y, the others at the
+    simulations to which the error model gives the largest density.
 
-    Args:
-        y: Standardised real statistics, shape ``(n, l)``.
-        log_density: :math:`\log q` of statistics, ``(m, l)`` to ``(m,)``.
-        simulated: Standardised simulated statistics, shape ``(n_s, l)``.
-        error_model: :math:`p(y \mid s)`, with :math:`\sigma` its ``spike_std``.
-        settings: Number of draws, chains and so on.
+    Standardised real statistics y are ``(n, l)``, simulated ones ``(n_s, l)``. Each
+    observation has ``num_draws`` draws from several chains, of which the first
+    ``warmup`` sweeps are thrown away and then all but every ``thin``-th.
 
     Returns:
         Draws of s, shape ``(n, num_draws, l)``, and the largest split-R-hat of the
         statistics of each observation, shape ``(n,)``.
     """
-    sigma = error_model.spike_std
-    kept = math.ceil(settings.num_draws / settings.num_chains)
-    draws, r_hats = [], []
-    for part in y.split(GROUP_SIZE):
-        start = _starts(part, simulated, error_model, settings.num_chains)
-        z = _slice_sample(part, start, log_density, error_model, settings, kept)
-        r_hats.append(split_r_hat(z).amax(dim=-1))
-        s = (
-            part[:, None, None]
-            - sigma * torch.sinh(z)[:, :, settings.thin - 1 :: settings.thin]
-        )
-        # Alternating between the chains, so that dropping the last ones of an uneven
-        # number takes from all alike.
-        draws.append(s.transpose(1, 2).flatten(1, 2)[:, : settings.num_draws])
-    return torch.cat(draws).to(y), torch.cat(r_hats).to(y)
+    rows = y.repeat_interleave(num_chains, dim=0).double()
+
+    @torch.no_grad()
+    def log_target(states: np.ndarray) -> np.ndarray:
+        z = torch.as_tensor(states).to(rows)
+        noise = error_model.spike_std * torch.sinh(z)
+        log_q = log_density((rows - noise).to(y)).double()
+        # The last two terms are the log of dn/dz up to a constant.
+        terms = error_model.log_prob(noise) + torch.logaddexp(z, -z)
+        return (log_q + terms.sum(dim=-1)).nan_to_num(nan=-torch.inf).cpu().numpy()
+
+    starts = _starts(y, simulated, error_model, num_chains)
+    sampler = SliceSamplerVectorized(
+        log_target,
+        starts.double().cpu().numpy(),
+        num_chains=len(rows),
+        tuning=warmup,  # all of what is not kept serves to tune the brackets
+        init_width=1.0,
+        max_width=MAX_WIDTH,
+        verbose=False,
+    )
+    z = torch.as_tensor(sampler.run(math.ceil(num_draws / num_chains) * thin))
+    z = z.to(rows).unflatten(0, (len(y), num_chains))
+    noise = error_model.spike_std * torch.sinh(z)[:, :, thin - 1 :: thin]
+    # Alternating between the chains, so that dropping the last ones of an uneven
+    # number takes from all alike.
+    s = (y[:, None, None] - noise).transpose(1, 2).flatten(1, 2)[:, :num_draws]
+    return s.to(y), split_r_hat(z).amax(dim=-1).to(y)
 
 
 def _starts(
     y: Tensor, simulated: Tensor, error_model: SpikeAndSlab, num_chains: int
 ) -> Tensor:
-    """Return the first z of each chain, ``(n, num_chains, l)``."""
+    """Return the first z of each chain, ``(n * num_chains, l)``."""
     starts = []
     for one in y:  # one at a time: n times n_s times l may be large
         log_prob = error_model.log_prob(one - simulated).sum(dim=-1)
         nearest = log_prob.topk(min(num_chains - 1, len(simulated))).indices
         # Of fewer simulations than chains some serve twice.
         nearest = nearest[torch.arange(num_chains - 1) % max(1, len(nearest))]
-        starts.append(torch.cat([one[None], simulated[nearest]]))
-    noise = y[:, None] - torch.stack(starts)
-    return torch.asinh(noise / error_model.spike_std)
-
-
-def _slice_sample(
-    y: Tensor,
-    start: Tensor,
-    log_density: Callable[[Tensor], Tensor],
-    error_model: SpikeAndSlab,
-    settings: ChainSettings,
-    kept: int,
-) -> Tensor:
-    """Return all z after the warm-up, ``(n, num_chains, kept * thin, l)``, float64."""
-    y = y.repeat_interleave(settings.num_chains, dim=0).double()
-    sigma = error_model.spike_std
-
-    @torch.no_grad()
-    def log_target(states: np.ndarray) -> np.ndarray:
-        z = torch.as_tensor(states).to(y)
-        noise = sigma * torch.sinh(z)
-        log_q = log_density((y - noise).to(start.dtype)).double()
-        # The last two terms are the log of dn/dz up to a constant.
-        terms = error_model.log_prob(noise) + torch.logaddexp(z, -z)
-        return (log_q + terms.sum(dim=-1)).nan_to_num(nan=-torch.inf).cpu().numpy()
-
-    sampler = SliceSamplerVectorized(
-        log_target,
-        start.flatten(0, 1).double().cpu().numpy(),
-        num_chains=len(y),
-        tuning=settings.warmup,  # all of what is not kept serves to tune the brackets
-        init_width=1.0,
-        max_width=MAX_WIDTH,
-        verbose=False,
-    )
-    z = torch.as_tensor(sampler.run(kept * settings.thin)).to(y)
-    return z.unflatten(0, start.shape[:2])
+        starts.append(one - torch.cat([one[None], simulated[nearest]]))
+    return torch.asinh(torch.cat(starts) / error_model.spike_std)
 
 
 def split_r_hat(draws: Tensor) -> Tensor:

@@ -12,14 +12,7 @@ from sbi_rope._prior import PriorDistribution
 from sbi_rope._random import seeded
 from sbi_rope._standardisation import ROUNDING
 
-__all__ = [
-    "Standardise",
-    "Unbounded",
-    "VelocityField",
-    "follow",
-    "follow_back",
-    "matching_loss",
-]
+__all__ = ["Standardise", "Unbounded", "VelocityField"]
 
 # Units of each layer, and residual blocks.
 HIDDEN, NUM_BLOCKS = 64, 5
@@ -36,12 +29,8 @@ MARGIN = 1e-3
 class VelocityField(nn.Module):
     r"""A residual network :math:`v(z, t, c)`.
 
-    The last layer starts at zero, so that an untrained field moves nothing.
-
-    Args:
-        size: Entries of z.
-        condition: Maps conditions ``(n, *event)`` to vectors ``(n, k)``.
-        condition_size: k.
+    The last layer starts at zero, so that an untrained field moves nothing. The
+    conditions c are vectors, to which ``condition`` maps observations.
     """
 
     def __init__(self, size: int, condition: nn.Module, condition_size: int) -> None:
@@ -65,56 +54,44 @@ class VelocityField(nn.Module):
             hidden = hidden + block(hidden)
         return self.last(hidden)
 
+    def loss(self, start: Tensor, end: Tensor, c: Tensor) -> Tensor:
+        r"""Return the loss of flow matching along straight paths, at random times.
 
-def matching_loss(
-    field: VelocityField, start: Tensor, end: Tensor, c: Tensor
-) -> Tensor:
-    r"""Return the loss of flow matching along straight paths, each at a random time.
+        .. math::
+            \bigl\lVert v\bigl((1 - (1 - \sigma) t) z_0 + t z_1,\, t,\, c\bigr)
+            - (z_1 - z_0) \bigr\rVert^2 / m, \qquad t \sim U(0, 1)
+        """
+        t = torch.rand_like(start[:, :1])
+        between = (1 - (1 - SIGMA) * t) * start + t * end
+        return (self(between, t, c) - (end - start)).square().mean()
 
-    .. math::
-        \bigl\lVert v\bigl((1 - (1 - \sigma) t) z_0 + t z_1,\, t,\, c\bigr)
-        - (z_1 - z_0) \bigr\rVert^2 / m, \qquad t \sim U(0, 1)
-    """
-    t = torch.rand_like(start[:, :1])
-    between = (1 - (1 - SIGMA) * t) * start + t * end
-    return (field(between, t, c) - (end - start)).square().mean()
+    def follow(self, z: Tensor, c: Tensor) -> Tensor:
+        """Carry points ``(n, m)`` along the field, from time 0 to 1."""
+        return _integrated(
+            lambda z, t: self(z, torch.full_like(z[:, :1], t), c), z, start=0.0, end=1.0
+        )
 
+    def follow_back(self, z: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
+        r"""Carry points ``(n, m)`` back, from time 1 to 0.
 
-def follow(field: VelocityField, z: Tensor, c: Tensor) -> Tensor:
-    """Carry points ``(n, m)`` along the field, from time 0 to 1."""
+        The second result is :math:`\int_0^1 \nabla \cdot v\, dt` along their ways.
+        """
 
-    def velocity(z: Tensor, t: float) -> Tensor:
-        return field(z, torch.full_like(z[:, :1], t), c)
+        def velocity(state: Tensor, t: float) -> Tensor:
+            z = state[:, :-1]
+            time = torch.full_like(z[:, :1], t)
+            v, divergence = torch.zeros_like(z), torch.zeros_like(time)
+            for k, direction in enumerate(torch.eye(z.shape[1]).to(z)):
+                moved: Any = torch.func.jvp(
+                    lambda z: self(z, time, c), (z,), (direction.expand_as(z),)
+                )
+                v, divergence = moved[0], divergence + moved[1][:, k : k + 1]
+            return torch.cat([v, divergence], dim=1)
 
-    return _integrated(velocity, z, start=0.0, end=1.0)
-
-
-def follow_back(field: VelocityField, z: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Carry points back, from time 1 to 0.
-
-    Returns:
-        The points, ``(n, m)``, and :math:`\int_0^1 \nabla \cdot v\, dt` along their
-        ways, ``(n,)``.
-    """
-
-    def velocity(state: Tensor, t: float) -> Tensor:
-        z = state[:, :-1]
-        time = torch.full_like(z[:, :1], t)
-        directions = torch.eye(z.shape[1]).to(z)
-        divergence = torch.zeros_like(time)
-        v = torch.zeros_like(z)
-        for k, direction in enumerate(directions):
-            moved: Any = torch.func.jvp(
-                lambda z: field(z, time, c), (z,), (direction.expand_as(z),)
-            )
-            v, change = moved
-            divergence = divergence + change[:, k : k + 1]
-        return torch.cat([v, divergence], dim=1)
-
-    state = torch.cat([z, torch.zeros_like(z[:, :1])], dim=1)
-    state = _integrated(velocity, state, start=1.0, end=0.0)
-    # The way back has summed it with the opposite sign.
-    return state[:, :-1], -state[:, -1]
+        state = torch.cat([z, torch.zeros_like(z[:, :1])], dim=1)
+        state = _integrated(velocity, state, start=1.0, end=0.0)
+        # The way back has summed it with the opposite sign.
+        return state[:, :-1], -state[:, -1]
 
 
 def _integrated(
@@ -130,12 +107,10 @@ def _integrated(
 
 
 class Standardise(nn.Module):
-    """Rows in standard deviations from their mean; ``inverse`` undoes it.
+    """Rows ``(n, m)`` in standard deviations from their mean; ``inverse`` undoes it.
 
-    Args:
-        rows: Shape ``(n, m)``. A column that does not vary has a deviation of one.
-        shared: Whether all columns share a standard deviation, as those of a series. It
-            is that of columns that vary.
+    A column that does not vary has a deviation of one. The columns of a series share
+    one, that of columns that vary.
     """
 
     mean: Tensor
@@ -168,9 +143,6 @@ class Unbounded(nn.Module):
     Parameters that are on a bound, or nearer to it than a thousandth of the range, are
     taken for parameters at that distance. On the bound they would be infinitely far
     away, and the density there would be arbitrary.
-
-    Args:
-        prior: A torch distribution over parameters of shape ``(d,)``.
     """
 
     low: Tensor
@@ -178,11 +150,10 @@ class Unbounded(nn.Module):
 
     def __init__(self, prior: Distribution) -> None:
         super().__init__()
-        self.prior = PriorDistribution(prior)
+        self._prior = PriorDistribution(prior)
         with seeded(0):
-            draws = self.prior.sample((NUM_DRAWS,))
-        self._set_transform(draws.device)
-        low, high = self.prior.bounds(draws[0])
+            draws = self._prior.sample((NUM_DRAWS,))
+        low, high = self._prior.bounds(draws[0])
         # Where only one bound is known, the range is that of a uniform distribution
         # with the same standard deviation.
         margin = MARGIN * 12**0.5 * draws.std(dim=0)
@@ -190,62 +161,33 @@ class Unbounded(nn.Module):
         self.register_buffer("high", high - margin)
         self.unit = Standardise(self._transform(self._off_bounds(draws)))
 
-    def _set_transform(self, device: torch.device) -> None:
-        self.prior.to(device)
-        with seeded(0):  # sbi draws from the prior to look at it
-            self._transform: Any = mcmc_transform(self.prior, device=str(device))
+    @property
+    def prior(self) -> PriorDistribution:
+        """The prior, where the parameters are: it is no module that could be moved."""
+        self._prior.to(self.low.device)
+        return self._prior
 
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:  # noqa: FBT001, FBT002
-        before = self.unit.mean.device
-        moved = super()._apply(fn, recurse)
-        if self.unit.mean.device != before:
-            self._set_transform(self.unit.mean.device)
-        return moved
+    @property
+    def _transform(self) -> Any:
+        with seeded(0):  # sbi draws from the prior to look at it
+            return mcmc_transform(self.prior, device=str(self.low.device))
 
     def _off_bounds(self, theta: Tensor) -> Tensor:
         return theta.maximum(self.low.to(theta)).minimum(self.high.to(theta))
 
     def transformed(self, theta: Tensor) -> Tensor:
-        """Return parameters without bounds, ``(n, d)``."""
+        """Return parameters inside the support without bounds, ``(n, d)``."""
         return self.unit(self._transform(self._off_bounds(theta)))
 
     def inverse(self, u: Tensor) -> Tensor:
         """Return the parameters of transformed ones, ``(n, d)``."""
         return self._transform.inv(self.unit.inverse(u))
 
-    def contains(self, theta: Tensor) -> Tensor:
-        """Tell which parameters ``(n, d)`` can be transformed."""
-        return self.transformed_inside(theta)[2]
-
-    def replaced(self, theta: Tensor) -> Tensor:
-        """Replace parameters outside the prior's support by draws of the prior."""
-        prior = self.prior.sample((len(theta),)).to(theta)
-        return torch.where(self.contains(theta)[:, None], theta, prior)
-
-    def transformed_inside(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Transform parameters that may be outside the prior's support.
-
-        Returns:
-            Transformed parameters ``(n, d)``, the logarithm of the volume that the
-            transform multiplies by, ``(n,)``, and which rows are inside. The others
-            have zeros.
-        """
-        safe, inside = self.prior.moved_inside(theta)
-        u = self.transformed(safe)
-        log_scale = self.log_scale(u)
-        inside = inside & torch.isfinite(u).all(dim=1) & torch.isfinite(log_scale)
-        u, log_scale = u.where(inside[:, None], 0.0), log_scale.where(inside, 0.0)
-        return u, log_scale, inside
-
     def log_scale(self, u: Tensor) -> Tensor:
         """Return the log volume that the transform to u multiplies by, ``(n,)``.
 
         It does not go by the parameters, which can be on a bound by rounding.
         """
-        line = self.unit.inverse(u).double()
-        log_scale = -self._transform.inv.log_abs_det_jacobian(
-            line, self._transform.inv(line)
-        )
-        if log_scale.ndim == 2:
-            log_scale = log_scale.sum(dim=1)
-        return log_scale.to(u) - self.unit.std.log().sum()
+        inverse, line = self._transform.inv, self.unit.inverse(u).double()
+        log_scale = -inverse.log_abs_det_jacobian(line, inverse(line)).to(u)
+        return log_scale.reshape(len(u), -1).sum(dim=1) - self.unit.std.log().sum()

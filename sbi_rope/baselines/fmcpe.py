@@ -1,7 +1,6 @@
 r"""Flow matching corrected posterior estimation (FMCPE)."""
 
 import copy
-from collections.abc import Callable
 from typing import Any, Literal
 
 import torch
@@ -11,19 +10,13 @@ from torch.distributions import Distribution
 from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalDensityEstimator, direct_posterior, embed
 from sbi_rope._standardisation import warn_of_far_entries
-from sbi_rope.baselines.flow_matching import (
-    Standardise,
-    Unbounded,
-    VelocityField,
-    follow,
-    follow_back,
-    matching_loss,
-)
-from sbi_rope.baselines.networks import fresh_copy
+from sbi_rope.baselines.flow_matching import Standardise, Unbounded, VelocityField
+from sbi_rope.baselines.networks import fit_rows, fresh_copy
 from sbi_rope.baselines.statistics import OverDraws, frozen_statistics
 from sbi_rope.data import split_pairs
 from sbi_rope.density import Density
-from sbi_rope.fit import History, Training, epochs_on_pairs, fit, shuffled
+from sbi_rope.ensemble import drawn
+from sbi_rope.fit import History, Training
 from sbi_rope.settings import Positive, check
 from sbi_rope.simulate import draws
 from sbi_rope.trainers.base import Method
@@ -31,13 +24,6 @@ from sbi_rope.trainers.training import EstimatorBuilder
 
 __all__ = ["FMCPE"]
 
-DEFAULT_TRAINING = Training(
-    training_batch_size=256,
-    learning_rate=1e-3,
-    validation_fraction=0.2,
-    stop_after_epochs=300,
-    max_num_epochs=300,
-)
 # The simulations like an observation that the density averages over, and those at the
 # parameters of each pair. Fewer are made if they are large.
 NUM_DRAWS, SIMULATIONS_PER_PAIR = 100, 100
@@ -73,9 +59,8 @@ class FMCPE(Method):
     along the way of theta back to :math:`\theta_0`. The noise :math:`\xi_k`, K = 100,
     is drawn once and is the same for all observations.
 
-    Sees simulations and the calibration set, and simulates at the calibration
-    parameters. It assumes little about what is wrong, and has to learn all of it from
-    the pairs, which takes hundreds of them.
+    It sees simulations and the calibration set. It assumes little about what is wrong,
+    and has to learn all of it from the pairs, which takes hundreds of them.
 
     References:
         | Flow Matching for Robust Simulation-Based Inference under Model
@@ -83,10 +68,7 @@ class FMCPE(Method):
         | https://arxiv.org/abs/2509.23385
 
     Args:
-        prior, density_estimator, npe_training, device: See :class:`Method`.
-        simulator: Maps parameters to simulations, batched or not. Without one, the
-            appended simulations with the nearest parameters take the place of
-            simulations at the calibration parameters.
+        prior, density_estimator, npe_training, simulator, device: See :class:`Method`.
         space: Where observations are mapped to simulations: as they are (``"input"``,
             as published), or by their embedding, h(x_o) to h(x).
         noise: :math:`\epsilon`, in standard deviations of the simulations. The paper
@@ -94,35 +76,33 @@ class FMCPE(Method):
             way to a simulation starts at standard normal noise alone.
         training: How the fields are trained, at a rate that falls to zero along a
             cosine; 300 epochs in batches of 256 if None.
-
-    Raises:
-        UnsupportedPosteriorError: In ``train``, if the estimator has no density.
     """
 
     sees = frozenset({"simulations", "calibration"})
     starts_from_npe = True
     simulates = True
+    default_training = Training(
+        training_batch_size=256,
+        learning_rate=1e-3,
+        validation_fraction=0.2,
+        stop_after_epochs=300,
+        max_num_epochs=300,
+    )
 
     def __init__(
         self,
         prior: Any,
         density_estimator: str | EstimatorBuilder = "nsf",
         *,
-        simulator: Callable[[Any], Any] | None = None,
         space: Space = "input",
         noise: float | None = 0.05,
-        npe_training: Training | None = None,
-        training: Training | None = None,
-        device: str | torch.device = "cpu",
+        **options: Any,
     ) -> None:
-        check("space", space, Literal["input", "embedding"])
+        check("space", space, Space)
         check("noise", noise, Positive | None)
-        super().__init__(
-            prior, density_estimator, npe_training, simulator=simulator, device=device
-        )
+        super().__init__(prior, density_estimator, **options)
         self.space: Space = space
         self.noise = noise
-        self.training = training or DEFAULT_TRAINING
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
@@ -142,24 +122,46 @@ class FMCPE(Method):
         unit = Standardise(bank.flatten(0, 1), shared=share)
         # Real observations may be far from simulations, so that they have a unit of
         # their own where the fields see them. One observation has none.
-        observed = embed(statistics, x).flatten(1)
-        seen_in = Standardise(observed, shared=share) if len(x) > 1 else unit
+        observed = embed(statistics, x)
+        seen_in = Standardise(observed.flatten(1), shared=share) if len(x) > 1 else unit
         to_simulations = ToSimulations(
+            h if self.space == "input" else nn.Identity(),
             density,
             statistics,
             unit,
             self._field(x, seen_in, h, size=bank.shape[-1]),
-            h if self.space == "input" else nn.Identity(),
-            event_shape=x.shape[1:],
+            shapes=(x.shape[1:], observed.shape[1:]),
             noise=self.noise,
         ).to(self._device)
         pushed = PushedForward(
             to_simulations, self._prior, self._field(x, seen_in, h, size=theta.shape[1])
         ).to(self._device)
-        history = self._train(
-            pushed, to_simulations, density, bank, show_progress_bars=show_progress_bars
+        u = pushed.unbounded.transformed(theta)
+
+        def loss(rows: Tensor) -> Tensor:
+            some = torch.randint(bank.shape[1], (len(rows),))
+            of_simulations, z = to_simulations.field_loss(x[rows], bank[rows, some])
+            of_theta = pushed.field_loss(x[rows], z, u[rows])
+            return 0.5 * of_simulations + 0.5 * of_theta
+
+        def held_out_loss(rows: Tensor) -> Tensor:
+            # The same noise for all epochs, so that they can be compared.
+            with seeded(0):
+                return loss(rows.repeat(-(-NUM_HELD_OUT // len(rows))))
+
+        history = fit_rows(
+            nn.ModuleList([to_simulations.field, pushed.field]),
+            loss,
+            split_pairs(theta, self.training.validation_fraction),
+            self.training,
+            validation_loss=held_out_loss,
+            pairs=theta,
+            decay=True,
+            in_training_mode=False,
+            label="FMCPE",
+            show_progress_bars=show_progress_bars,
         )
-        return direct_posterior(pushed.eval(), self._prior), history
+        return direct_posterior(pushed, self._prior), history
 
     def _field(
         self, x: Tensor, unit: Standardise, h: nn.Module, *, size: int
@@ -167,64 +169,12 @@ class FMCPE(Method):
         """Return an untrained velocity field of so many entries."""
         condition: nn.Module
         if self.space == "embedding":
-            condition = nn.Sequential(Frozen(copy.deepcopy(h)), nn.Flatten(), unit)
+            condition = nn.Sequential(copy.deepcopy(h), nn.Flatten(), unit)
         elif x[0].numel() > MAX_SUMMARIES and any(True for _ in h.parameters()):
             condition = nn.Sequential(fresh_copy(h), nn.Flatten())
         else:
             condition = nn.Sequential(nn.Flatten(), unit)
         return VelocityField(size, condition, embed(condition, x[:1]).shape[1]).to(x)
-
-    def _train(
-        self,
-        pushed: "PushedForward",
-        to_simulations: "ToSimulations",
-        density: ConditionalDensityEstimator,
-        bank: Tensor,
-        *,
-        show_progress_bars: bool,
-    ) -> History:
-        theta, x = self._data.calibration
-        u = pushed.unbounded.transformed(theta)
-        size = self.training.training_batch_size
-        train, held_out = split_pairs(theta, self.training.validation_fraction)
-        train, held_out = train.to(x.device), held_out.to(x.device)
-        max_num_epochs = epochs_on_pairs(theta, held_out, self.training.max_num_epochs)
-
-        def loss(rows: Tensor) -> Tensor:
-            some = torch.randint(bank.shape[1], (len(rows),)).to(bank.device)
-            of_simulations, simulated = to_simulations.field_loss(
-                x[rows], bank[rows, some]
-            )
-            with torch.no_grad():
-                start = density.sample(torch.Size((1,)), simulated)[0]
-            return 0.5 * of_simulations + 0.5 * pushed.loss(x[rows], start, u[rows])
-
-        def held_out_loss() -> Tensor:
-            # The same noise for all epochs, so that they can be compared.
-            repeats = -(-NUM_HELD_OUT // len(held_out))
-            with seeded(0):
-                return loss(held_out.repeat(repeats))
-
-        [history] = fit(
-            nn.ModuleList([to_simulations.field, pushed.field]),
-            lambda epoch: zip(shuffled(train, size), strict=True),
-            loss,
-            self.training,
-            validation_loss=held_out_loss if len(held_out) else None,
-            max_num_epochs=max_num_epochs,
-            decay=True,
-            label="FMCPE",
-            show_progress_bars=show_progress_bars,
-        )
-        return history
-
-
-class Frozen(nn.Sequential):
-    """A net that stays in evaluation mode while what contains it is trained."""
-
-    def train(self, mode: bool = True) -> "Frozen":  # noqa: FBT001, FBT002
-        """Do not switch to training mode."""
-        return super().train(mode=False)
 
 
 class ToSimulations(OverDraws):
@@ -234,30 +184,25 @@ class ToSimulations(OverDraws):
         \tfrac1K \sum_k q(\theta \mid s_k), \qquad
         s_k = h\bigl(T_x(x_o + \epsilon\, \xi_k;\, x_o)\bigr)
 
-    Args:
-        density: :math:`q(\theta \mid s)`.
-        statistics: What is mapped of an observation: itself, or its embedding.
-        unit: Standardises what is mapped.
-        field: The velocity field of the map.
-        then: From what it is mapped to, to the embedding that NPE's density sees.
-        event_shape: Shape of one observation.
-        noise: :math:`\epsilon`; None leaves the observation out of the start.
+    What is mapped, in a unit, are ``statistics`` of an observation: itself, or its
+    embedding. The shapes are those of both.
     """
 
     xi: Tensor
 
     def __init__(
         self,
+        net: nn.Module,
         density: ConditionalDensityEstimator,
         statistics: nn.Module,
         unit: Standardise,
         field: VelocityField,
-        then: nn.Module,
         *,
-        event_shape: torch.Size,
+        shapes: tuple[torch.Size, torch.Size],
         noise: float | None,
     ) -> None:
-        super().__init__(then, density, NUM_DRAWS, event_shape)
+        event_shape, self.shape = shapes
+        super().__init__(net, density, NUM_DRAWS, event_shape)
         self.statistics = statistics
         self.unit = unit
         self.field = field
@@ -265,114 +210,95 @@ class ToSimulations(OverDraws):
         # On the CPU, so that a seed means the same on every device.
         xi = torch.randn(NUM_DRAWS, len(unit.mean), device="cpu")
         self.register_buffer("xi", xi)
-        blank = unit.mean.new_zeros(1, *event_shape)
-        self.shape = embed(statistics, blank).shape[1:]
 
     def field_loss(self, x_o: Tensor, simulated: Tensor) -> tuple[Tensor, Tensor]:
         """Return the loss of the field, and the embeddings of simulations like x_o.
 
-        Args:
-            x_o: Observations, shape ``(n, *event)``.
-            simulated: A flat simulation with the same parameters, shape ``(n, m)``.
+        Each has a flat simulation with the same parameters, ``(n, m)``.
         """
         end, c = self.unit(simulated), self.field.condition(x_o)
-        centre, scale = self._start(x_o)
-        start, other = (centre + scale * torch.randn_like(end) for _ in range(2))
-        loss = matching_loss(self.field, start, end, c)
+        start, other = (self._start(x_o, torch.randn_like(end)) for _ in range(2))
+        loss = self.field.loss(start, end, c)
         with torch.no_grad():
-            return loss, self._embedded(follow(self.field, other, c))
+            return loss, self._embedded(self.field.follow(other, c))
 
     @torch.no_grad()
     def embed(self, x: Tensor) -> Tensor:
         """Return the embeddings of simulations like observations, ``(n, K, l)``."""
-        size = max(1, MAX_ENTRIES // self.xi.numel())
-        return torch.cat([self._like(part) for part in x.split(size)])
+        count, parts = self.num_members, []
+        for some in x.split(max(1, MAX_ENTRIES // self.xi.numel())):
+            rows = some.repeat_interleave(count, dim=0)
+            start = self._start(rows, self.xi.repeat(len(some), 1))
+            c = self.field.condition(some).repeat_interleave(count, dim=0)
+            z = self._embedded(self.field.follow(start, c))
+            parts.append(z.unflatten(0, (len(some), count)))
+        return torch.cat(parts)
 
-    def _like(self, x: Tensor) -> Tensor:
-        count = self.num_members
-        centre, scale = self._start(x)
-        start = (centre[:, None] + scale * self.xi).flatten(0, 1)
-        c = self.field.condition(x).repeat_interleave(count, dim=0)
-        embedded = self._embedded(follow(self.field, start, c))
-        return embedded.unflatten(0, (len(x), count))
-
-    def _start(self, x: Tensor) -> tuple[Tensor, float]:
-        """Return mean ``(n, m)`` and deviation of where ways to simulations start."""
-        flat = self.unit(embed(self.statistics, x).flatten(1))
+    def _start(self, x: Tensor, noise: Tensor) -> Tensor:
+        """Return where ways to simulations start, ``(n, m)``."""
         if self.noise is None:
-            return torch.zeros_like(flat), 1.0
-        return flat, self.noise
+            return noise
+        return self.unit(embed(self.statistics, x).flatten(1)) + self.noise * noise
 
     def _embedded(self, z: Tensor) -> Tensor:
         simulated = self.unit.inverse(z).reshape(len(z), *self.shape)
         return super().embed(simulated)[:, 0]
 
 
-class PushedForward(ConditionalDensityEstimator):
+class PushedForward(Density):
     r"""A density that a map :math:`T_\theta` carries on.
 
     What the density has outside the prior's support, the prior takes the place of:
 
     .. math:: p(\theta_0) = q(\theta_0) + (1 - Z)\, \pi(\theta_0), \qquad
         Z = \int_{\pi > 0} q .
-
-    Args:
-        base: The density of :math:`\theta_0` given an observation.
-        prior: The prior.
-        field: The velocity field of the map.
     """
 
     def __init__(
-        self, base: Density, prior: Distribution, field: VelocityField
+        self, base: ToSimulations, prior: Distribution, field: VelocityField
     ) -> None:
-        super().__init__(nn.Identity(), base.input_shape, base.condition_shape)
+        super().__init__(base.input_shape, base.condition_shape)
         self.base = base
         self.unbounded = Unbounded(prior)
         self.field = field
 
-    def loss(  # type: ignore[override]
-        self, x_o: Tensor, start: Tensor, end: Tensor
-    ) -> Tensor:
-        """Return the loss of flow matching, from draws of the base to ends in u."""
-        start = self.unbounded.transformed(self.unbounded.replaced(start))
-        return matching_loss(self.field, start, end, self.field.condition(x_o))
+    def field_loss(self, x_o: Tensor, z: Tensor, end: Tensor) -> Tensor:
+        """Return the loss of the field, from draws of q at embeddings to ends in u."""
+        with torch.no_grad():
+            start = self._started(self.base.densities.answer(drawn, z))
+        return self.field.loss(start, end, self.field.condition(x_o))
 
-    def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
-        """Return the log density, shape ``(S, B)``; -inf outside the support."""
-        theta = input if input.ndim == 3 else input[None]
-        count, num_rows = theta.shape[0], max(theta.shape[1], len(condition))
-        theta = theta.expand(count, num_rows, -1)
-        c = self.field.condition(condition)
-        c = c.expand(num_rows, -1).repeat(count, 1)
-        u, log_scale, inside = self.unbounded.transformed_inside(theta.flatten(0, 1))
-        u_start, divergence = follow_back(self.field, u, c)
-        start = self.unbounded.inverse(u_start)
-        usable = self.unbounded.contains(start)
-        base = self._log_prob_at_start(start.reshape(theta.shape), condition)
-        rest = log_scale - self.unbounded.log_scale(u_start) - divergence
-        log_prob = base + rest.reshape(count, num_rows)
-        inside = (inside & usable).reshape(count, num_rows)
-        return log_prob.where(inside, -torch.inf)
-
-    def _log_prob_at_start(self, start: Tensor, condition: Tensor) -> Tensor:
-        """Return the log density before the map, ``(S, B)``."""
+    def _started(self, theta: Tensor) -> Tensor:
+        """Return u of draws; the prior replaces those outside its support."""
         prior = self.unbounded.prior
-        z, num_rows = self.base.embed(condition), len(condition)
-        log_q = self.base.log_prob_given(start, z, num_rows).to(start)
-        if prior.is_unbounded:
-            return log_q
-        outside = 1 - self.base.mass(z, num_rows, self.unbounded.contains)
-        replaced = prior.log_prob(start)
-        return torch.logaddexp(log_q, outside.clamp_min(0).log().to(start) + replaced)
+        from_prior = prior.sample((len(theta),)).to(theta)
+        inside = prior.inside(theta)[:, None]
+        return self.unbounded.transformed(theta.where(inside, from_prior))
 
-    @torch.no_grad()
-    def sample(
-        self, sample_shape: torch.Size, condition: Tensor, **kwargs: Any
-    ) -> Tensor:
-        """Draw parameters, shape ``(*sample_shape, B, d)``."""
-        count, num_rows = torch.Size(sample_shape).numel(), len(condition)
-        start = self.base.sample(torch.Size((count,)), condition).flatten(0, 1)
-        u = self.unbounded.transformed(self.unbounded.replaced(start))
-        c = self.field.condition(condition).repeat(count, 1)
-        theta = self.unbounded.inverse(follow(self.field, u, c))
-        return theta.reshape(*sample_shape, num_rows, -1)
+    def embed(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the embeddings of simulations like x, and what the field sees."""
+        return self.base.embed(x), self.field.condition(x)
+
+    def log_q(self, theta: Tensor, z: tuple[Tensor, Tensor]) -> Tensor:
+        """Return the log density, shape ``(S, B)``; -inf outside the support."""
+        of_base, c = z
+        prior, unbounded = self.unbounded.prior, self.unbounded
+        safe, inside = prior.moved_inside(theta.flatten(0, 1))
+        u_end = unbounded.transformed(safe)
+        u, divergence = self.field.follow_back(u_end, c.repeat(len(theta), 1))
+        start = unbounded.inverse(u).reshape(theta.shape)
+        log_q = self.base.log_q(start, of_base)
+        log_prior = prior.log_prob(start)
+        if not prior.is_unbounded:
+            mass = self.base.mass(of_base, len(c), prior.inside)
+            outside = (1 - mass).clamp_min(0)
+            log_q = torch.logaddexp(log_q, outside.log() + log_prior)
+        rest = unbounded.log_scale(u_end) - unbounded.log_scale(u) - divergence
+        inside = inside.reshape(log_q.shape) & torch.isfinite(log_prior)
+        return (log_q + rest.reshape(log_q.shape)).where(inside, -torch.inf)
+
+    def draw(self, z: tuple[Tensor, Tensor], row: Tensor) -> Tensor:
+        """Draw once for each of n numbers of observations, ``(n, d)``."""
+        of_base, c = z
+        start = self._started(self.base.draw(of_base, row))
+        return self.unbounded.inverse(self.field.follow(start, c[row]))

@@ -1,7 +1,6 @@
 r"""FRISBI: a tuned embedding that is aligned with simulations while it is tuned."""
 
 import copy
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -10,12 +9,13 @@ from torch import Tensor, nn
 
 from sbi_rope._sbi import ConditionalDensityEstimator, embed
 from sbi_rope._standardisation import warn_of_far_entries
+from sbi_rope.baselines.networks import fit_rows
 from sbi_rope.baselines.statistics import frozen_statistics
 from sbi_rope.data import split_pairs
 from sbi_rope.density import Density, Flow, MixturePosterior, OverSimulations
 from sbi_rope.ensemble import Ensemble, embedded, log_density
 from sbi_rope.finetuning import trainable_copy
-from sbi_rope.fit import History, Training, epochs_on_pairs, fit, fit_on_pairs, shuffled
+from sbi_rope.fit import History, Training
 from sbi_rope.settings import Positive, check
 from sbi_rope.simulate import targets
 from sbi_rope.trainers.base import Method
@@ -23,13 +23,6 @@ from sbi_rope.trainers.training import EstimatorBuilder
 
 __all__ = ["FRISBI"]
 
-DEFAULT_TRAINING = Training(
-    training_batch_size=64,
-    learning_rate=1e-4,
-    validation_fraction=0.2,
-    stop_after_epochs=100,
-    max_num_epochs=100,
-)
 # How the density is distilled.
 DISTILLING = Training(
     training_batch_size=500,
@@ -63,11 +56,10 @@ class FRISBI(Method):
     q(\theta \mid h(x_{s,j}))`, or a density :math:`q_\phi(\theta \mid g(x))` that is
     trained on draws of it.
 
-    Sees simulations, the calibration set and observations without parameters. Each
+    It sees simulations, the calibration set and observations without parameters. Each
     row of the coupling is independent of the others: it is RoPE's with tau = 0, which
-    does not trust the prior, and it answers for any x. The second term has a minimum
-    wherever observations are on top of simulations, whichever these are, so that it
-    assumes that g starts near the right ones.
+    does not trust the prior, and it answers for any x. It assumes that g starts near
+    the right simulations: the second term is small near any of them.
 
     References:
         | Inductive Domain Transfer in Misspecified Simulation-Based Inference (Senouf
@@ -75,69 +67,47 @@ class FRISBI(Method):
         | https://arxiv.org/abs/2508.15593
 
     Args:
-        prior, density_estimator, npe_training, device: See :class:`Method`.
-        simulator: Maps parameters to simulations, batched or not. Without one, the
-            appended simulations take its place.
+        prior, density_estimator, npe_training, simulator, device: See :class:`Method`.
         gamma: :math:`\gamma`, in units of the mean squared difference of embeddings.
         distilled: Whether the posterior is :math:`q_\phi`.
         training: How g is trained, in batches of observations, each with all pairs; 100
             epochs in batches of 64 if None.
-
-    Raises:
-        UnsupportedPosteriorError: In ``train``, if the estimator has no density.
     """
 
     sees = frozenset({"simulations", "calibration", "observations"})
     starts_from_npe = True
     simulates = True
+    default_training = Training(
+        training_batch_size=64,
+        learning_rate=1e-4,
+        validation_fraction=0.2,
+        stop_after_epochs=100,
+        max_num_epochs=100,
+    )
 
     def __init__(
         self,
         prior: Any,
         density_estimator: str | EstimatorBuilder = "nsf",
         *,
-        simulator: Callable[[Any], Any] | None = None,
         gamma: float = 0.5,
         distilled: bool = False,
-        npe_training: Training | None = None,
-        training: Training | None = None,
-        device: str | torch.device = "cpu",
+        **options: Any,
     ) -> None:
         check("gamma", gamma, Positive)
-        super().__init__(
-            prior, density_estimator, npe_training, simulator=simulator, device=device
-        )
+        super().__init__(prior, density_estimator, **options)
         self.gamma = gamma
         self.distilled = distilled
-        self.training = training or DEFAULT_TRAINING
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
         h, density = frozen_statistics(npe)
         warn_of_far_entries("x", self._data.calibration[1], h)
-        simulated, targets = self._simulated(h, show_progress_bars=show_progress_bars)
-        g = trainable_copy(h, targets)
-        event_shape = self._data.observations.shape[1:]
-        aligned = Aligned(
-            density, g, torch.cat([simulated, targets]), event_shape, self.gamma
-        )
-        history = self._train(aligned, targets, show_progress_bars=show_progress_bars)
-        found: Density = aligned.eval()
-        if self.distilled:
-            found = self._distilled(aligned, show_progress_bars=show_progress_bars)
-        return MixturePosterior(found, self._prior), history
-
-    def _simulated(
-        self, h: nn.Module, *, show_progress_bars: bool
-    ) -> tuple[Tensor, Tensor]:
-        """Return embeddings of simulations from the prior, and the targets of pairs."""
-        source = self._source()
-
-        embedding = partial(embed, h)
+        source, embedding = self._source(), partial(embed, h)
         _, simulated = source.from_prior(
             NUM_SIMULATIONS, embedding, progress=show_progress_bars
         )
-        return simulated, targets(
+        z = targets(
             source,
             self._data.pairs,
             SIMULATIONS_PER_TARGET,
@@ -145,49 +115,48 @@ class FRISBI(Method):
             num_neighbors=NUM_NEIGHBORS,
             progress=show_progress_bars,
         )
-
-    def _train(
-        self, aligned: "Aligned", targets: Tensor, *, show_progress_bars: bool
-    ) -> History:
+        aligned = Aligned(
+            density,
+            trainable_copy(h, z),
+            torch.cat([simulated, z]),
+            self._data.observations.shape[1:],
+            self.gamma,
+        )
         theta, x = self._data.calibration
         x_o = self._data.observations
         train, held_out = split_pairs(theta, self.training.validation_fraction)
-        train, held_out = train.to(x.device), held_out.to(x.device)
-        max_num_epochs = epochs_on_pairs(theta, held_out, self.training.max_num_epochs)
 
-        def error(rows: Tensor) -> Tensor:
-            return (aligned.g(x[rows]) - targets[rows]).square().mean()
+        def error(pairs: Tensor) -> Tensor:
+            return (aligned.g(x[pairs]) - z[pairs]).square().mean()
 
-        def loss(some: Tensor) -> Tensor:
-            return error(train) + aligned.transport_cost(x_o[some])
-
-        every, size = torch.arange(len(x_o)), self.training.training_batch_size
-        [history] = fit(
+        history = fit_rows(
             aligned.g,
-            lambda epoch: zip(shuffled(every.to(x_o.device), size), strict=True),
-            loss,
+            lambda rows: error(train) + aligned.transport_cost(x_o[rows]),
+            (torch.arange(len(x_o)), held_out),
             self.training,
-            validation_loss=(lambda: error(held_out)) if len(held_out) else None,
-            max_num_epochs=max_num_epochs,
+            validation_loss=error,
+            pairs=theta,
             in_training_mode=False,
             label="FRISBI",
             show_progress_bars=show_progress_bars,
         )
-        return history
+        found: Density = aligned.eval()
+        if self.distilled:
+            found = self._distilled(aligned, show_progress_bars=show_progress_bars)
+        return MixturePosterior(found, self._prior), history
 
     def _distilled(self, aligned: "Aligned", *, show_progress_bars: bool) -> Flow:
         """Return a density given g(x) that is trained on draws of the mixture."""
         x_o = self._data.observations
-        theta = aligned.sample(torch.Size((NUM_DRAWS,)), x_o)
-        observation = torch.arange(len(x_o)).repeat(NUM_DRAWS)
+        theta = aligned.sample(torch.Size((NUM_DRAWS,)), x_o).flatten(0, 1)
+        z, number = embed(aligned.g, x_o), torch.arange(len(x_o)).repeat(NUM_DRAWS)
         density = copy.deepcopy(aligned.density).requires_grad_()
-        fit_on_pairs(
+        fit_rows(
             density,
-            theta.flatten(0, 1),
-            embed(aligned.g, x_o)[observation.to(x_o.device)],
+            lambda rows: density.loss(theta[rows], condition=z[number[rows]]).mean(),
             # No observation is both trained on and held out.
-            split_pairs(observation, DISTILLING.validation_fraction),
-            training=DISTILLING,
+            split_pairs(number, DISTILLING.validation_fraction),
+            DISTILLING,
             in_training_mode=False,
             label="Distilling",
             show_progress_bars=show_progress_bars,
@@ -207,12 +176,7 @@ class Aligned(OverSimulations):
         \alpha_j(x) \propto \exp\bigl(-\lVert g(x) - s_j \rVert^2
         / (l \gamma)\bigr)
 
-    Args:
-        density: :math:`q(\theta \mid s)`.
-        g: The embedding net of observations.
-        simulated: :math:`s_j`, shape ``(n_s, l)``.
-        event_shape: Shape of one observation.
-        gamma: :math:`\gamma`.
+    The simulations :math:`s_j` are embedded, shape ``(n_s, l)``.
     """
 
     def __init__(
@@ -233,14 +197,16 @@ class Aligned(OverSimulations):
 
     def rows(self, z: Tensor) -> Tensor:
         """Return the weights of the simulations, ``(b, n_s)``; rows sum to one."""
-        cost = self._cost(z.double(), self.simulated.double())
-        return torch.softmax(-cost / self.gamma, dim=1)
+        return self._weights(_cost(z.double(), self.simulated.double()))
 
     def transport_cost(self, x: Tensor) -> Tensor:
         """Return the mean cost of a coupling of observations, with its gradient."""
-        cost = self._cost(self.g(x), self.simulated)
-        return (torch.softmax(-cost / self.gamma, dim=1) * cost).sum(dim=1).mean()
+        cost = _cost(self.g(x), self.simulated)
+        return (self._weights(cost) * cost).sum(dim=1).mean()
 
-    def _cost(self, real: Tensor, simulated: Tensor) -> Tensor:
-        difference = real[:, None] - simulated
-        return difference.square().mean(dim=2)
+    def _weights(self, cost: Tensor) -> Tensor:
+        return torch.softmax(-cost / self.gamma, dim=1)
+
+
+def _cost(real: Tensor, simulated: Tensor) -> Tensor:
+    return (real[:, None] - simulated).square().mean(dim=2)

@@ -1,7 +1,6 @@
 """The hybrid VAE (HVAE): a deterministic simulator inside of an auto-encoder."""
 
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -9,33 +8,24 @@ from torch import Tensor
 
 from sbi_rope._random import seeded
 from sbi_rope._sbi import posterior_from
-from sbi_rope._standardisation import ROUNDING
 from sbi_rope.baselines.hvae_model import (
+    ConditionalUNet,
     ContinuedPrior,
     HybridVAE,
     LatentEncoder,
-    drawn,
 )
-from sbi_rope.baselines.networks import ConditionalUNet
+from sbi_rope.baselines.networks import fit_rows
 from sbi_rope.baselines.statistics import OverDraws, frozen_statistics
-from sbi_rope.data import split_pairs, too_few_pairs
-from sbi_rope.density import Density
+from sbi_rope.data import split_pairs
 from sbi_rope.ensemble import embedded
-from sbi_rope.errors import InvalidInputError, warn_user
-from sbi_rope.fit import History, Training, fit
+from sbi_rope.errors import InvalidInputError
+from sbi_rope.fit import History, Training
 from sbi_rope.settings import Count, check
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.training import EstimatorBuilder
 
 __all__ = ["HVAE"]
 
-DEFAULT_TRAINING = Training(
-    training_batch_size=100,
-    learning_rate=1e-3,
-    validation_fraction=0.2,
-    stop_after_epochs=30,
-    max_num_epochs=100,
-)
 # Length of z, its draws behind the posterior, and behind the loss on held-out pairs.
 LATENT_DIM, NUM_LATENTS, NUM_LATENTS_HELD_OUT = 5, 64, 8
 # Most entries of series or images that the U-Net sees at a time.
@@ -58,19 +48,15 @@ class HVAE(Method):
     Inference: :math:`z \sim q(z \mid x_o)`, a simulation like the observation,
     :math:`\tilde x = \mathrm{R2P}(x_o, z)`, and :math:`\theta \sim q(\theta \mid
     h(\tilde x))` by NPE, which stays as it is. Explanation: the deterministic physics
-    :math:`f(\theta)`, to which P2R adds with z what it lacks. P2R and R2P are U-Nets
-    whose means are their inputs plus what they learn, and the mean of R2P is taken;
-    :math:`q(z \mid x_o)` is an embedding net like that of NPE, untrained, with a linear
-    layer. An observation has m entries. The posterior mixes :math:`q(\theta \mid
-    h(\tilde x))` over 64 draws of z whose noise is fixed.
+    :math:`f(\theta)`, to which P2R adds with z what it lacks. P2R and R2P are U-Nets;
+    :math:`q(z \mid x_o)` is an untrained embedding net with a linear layer. An
+    observation has m entries. The posterior mixes :math:`q(\theta \mid h(\tilde x))`
+    over 64 draws of z. The epoch that is best on held-out pairs is kept.
 
-    Sees simulations, the calibration set and observations without parameters. Their
-    means and standard deviations scale the data; a part of the pairs is held out, and
-    the epoch with the largest log-probability on them is kept, the start included. Of
-    fewer than 5 pairs none is held out, and the objective on held-out observations
-    decides; of fewer than 5 observations the last epoch is kept. Assumes series or
-    images, a simulator that can be differentiated once its noise is left out, and a
-    prior on a box. The densities stay as narrow as those of NPE.
+    It sees simulations, the calibration set and observations without parameters. It
+    assumes series or images, a simulator that can be differentiated once its noise is
+    left out, and a prior on a box, whose sides may be infinite. The densities stay as
+    narrow as those of NPE.
 
     References:
         | Physics-Integrated Variational Autoencoders for Robust and Interpretable
@@ -81,27 +67,30 @@ class HVAE(Method):
         | https://arxiv.org/abs/2405.08719
 
     Args:
-        prior: A torch distribution over parameters of shape ``(d,)``, its support a
-            box, whose sides may be infinite.
+        prior, npe_training, device: See :class:`Method`.
         density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns; a
             normalizing flow of nflows or zuko.
         physics: f, from theta ``(n, d)`` to ``(n, *event)``: the simulator without
             noise and nuisances, differentiable by torch.
-        npe_training: How NPE is trained; ``Training()`` if None.
         training: How the networks are trained; at most 100 passes over the observations
             in batches of 100 at a learning rate of 1e-3, and 30 without improvement, if
             None.
         width: Channels of the first block of the U-Nets. The paper has 64; 8 takes a
             fraction of the time on a CPU.
-        device: Where to train; data on other devices is moved there.
 
     Raises:
-        InvalidInputError: If the prior's support is not a box. In ``train``, if the
-            physics is not differentiable.
+        InvalidInputError: In ``train``, if the physics is not differentiable.
     """
 
     sees = frozenset({"simulations", "calibration", "observations"})
     starts_from_npe = True
+    default_training = Training(
+        training_batch_size=100,
+        learning_rate=1e-3,
+        validation_fraction=0.2,
+        stop_after_epochs=30,
+        max_num_epochs=100,
+    )
 
     def __init__(
         self,
@@ -109,116 +98,60 @@ class HVAE(Method):
         density_estimator: str | EstimatorBuilder = "nsf",
         *,
         physics: Callable[[Tensor], Tensor],
-        npe_training: Training | None = None,
-        training: Training | None = None,
         width: int = 64,
-        device: str | torch.device = "cpu",
+        **options: Any,
     ) -> None:
         check("width", width, Count)
-        super().__init__(prior, density_estimator, npe_training, device=device)
-        self._continued_prior = ContinuedPrior(self._prior)
-        self.training = training or DEFAULT_TRAINING
+        super().__init__(prior, density_estimator, **options)
         self.physics = physics
         self.width = width
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         with seeded(0):
-            theta = self._prior.sample(torch.Size((1,))).to(self._device, torch.float32)
-            if not self.physics(theta.requires_grad_()).requires_grad:
+            theta = self._prior.sample((1,)).requires_grad_()
+            if not self.physics(theta).requires_grad:
                 raise InvalidInputError(
                     "Expected `physics` to be differentiable by torch; got a result "
                     "without gradients."
                 )
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
-        model = self._model(npe)
-        # On the CPU, so that a seed means the same on every device.
-        noise = torch.randn(NUM_LATENTS, LATENT_DIM, device="cpu").to(self._device)
-        event_shape = self._data.observations.shape[1:]
-        posterior, held_out = (
-            OverLatents(model, noise[:count], event_shape)
-            for count in (NUM_LATENTS, NUM_LATENTS_HELD_OUT)
-        )
-        history = self._train(model, held_out, show_progress_bars=show_progress_bars)
-        return posterior_from(npe, posterior.eval()), history
-
-    def _model(self, npe: Any) -> HybridVAE:
         h, density = frozen_statistics(npe)
-        x = torch.cat([self._data.observations, self._data.calibration[1]])
-        # One number a channel: pixels that never change have no standard deviation. Nor
-        # has a channel that only rounding changes.
-        channels = x.transpose(0, 1).flatten(1) if x.ndim == 4 else x.reshape(1, -1)
-        std, mean = torch.std_mean(channels, dim=1)
-        unet = partial(
-            ConditionalUNet,
-            tuple(x.shape[1:]),
-            LATENT_DIM,
-            width=self.width,
-            mean=mean,
-            std=std.where(std > ROUNDING * mean.abs(), 1.0),
-        )
+        seen = torch.cat([self._data.observations, self._data.calibration[1]])
         model = HybridVAE(
-            LatentEncoder(h, LATENT_DIM, x),
-            unet(),
-            unet(),
+            LatentEncoder(h, LATENT_DIM, seen),
+            ConditionalUNet(seen, LATENT_DIM, width=self.width),
+            ConditionalUNet(seen, LATENT_DIM, width=self.width),
             npe=(h, density),
             physics=self.physics,
-            prior=self._continued_prior,
+            prior=ContinuedPrior(self._prior),
+        ).to(self._device)
+        # On the CPU, so that a seed means the same on every device.
+        noise = torch.randn(NUM_LATENTS, LATENT_DIM, device="cpu").to(self._device)
+        # They share the networks of the model.
+        posterior, scored = (
+            OverLatents(model, noise[:count], seen.shape[1:])
+            for count in (NUM_LATENTS, NUM_LATENTS_HELD_OUT)
         )
-        return model.to(self._device)
-
-    def _train(
-        self, model: HybridVAE, scored: Density, *, show_progress_bars: bool
-    ) -> History:
-        """Train in place; held out are pairs, or observations if pairs are few.
-
-        The density shares the networks of the model, to score held-out pairs by.
-        """
         theta, x = self._data.calibration
-        x_o, training = self._data.observations, self.training
-        train, held_out = split_pairs(theta, training.validation_fraction)
-        pairs = theta[train], x[train]
-        validation_loss: Callable[[], Tensor] | None = None
-        if len(held_out):
+        train, held_out = split_pairs(theta, self.training.validation_fraction)
+        unlabelled = torch.cat([self._data.observations, x[train]])
 
-            def loss_of_pairs() -> Tensor:
-                return -scored.log_prob(theta[held_out], x[held_out]).mean()
+        def loss(rows: Tensor) -> Tensor:
+            order = train[torch.randperm(len(train))]
+            some = order[: self.training.training_batch_size]
+            return model.objective(unlabelled[rows], theta[some], x[some])
 
-            validation_loss = loss_of_pairs
-        else:
-            warn_user(
-                f"{too_few_pairs(theta)}: none is held out, and the networks "
-                "are chosen by the objective on held-out observations. Append at least "
-                "5 pairs of different parameters to choose them by what matters."
-            )
-            rows, held_out = split_pairs(
-                torch.arange(len(x_o)), training.validation_fraction
-            )
-            left_out, x_o = x_o[held_out], x_o[rows]
-
-            def objective() -> Tensor:
-                with seeded(0):  # or the luckiest epoch would be kept
-                    return model.objective(left_out, *pairs)
-
-            validation_loss = objective if len(held_out) else None
-        unlabelled = torch.cat([x_o, pairs[1]])
-
-        def batches(epoch: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-            """Pass over all observations, each batch together with one of pairs."""
-            size = training.training_batch_size
-            for rows in torch.randperm(len(unlabelled)).split(size):
-                some = torch.randperm(len(pairs[1]))[:size]
-                yield unlabelled[rows], pairs[0][some], pairs[1][some]
-
-        [history] = fit(
+        history = fit_rows(
             model,
-            batches,
-            model.objective,
-            training,
-            validation_loss=validation_loss,
+            loss,
+            (torch.arange(len(unlabelled)), held_out),
+            self.training,
+            validation_loss=lambda rows: scored.loss(theta[rows], x[rows]).mean(),
+            pairs=theta,
             label="HVAE",
             show_progress_bars=show_progress_bars,
         )
-        return history
+        return posterior_from(npe, posterior.eval()), history
 
 
 class OverLatents(OverDraws):
@@ -228,12 +161,8 @@ class OverLatents(OverDraws):
         \tfrac1S \sum_k q(\theta \mid h(\mathrm{R2P}(x_o, z_k))), \quad
         z_k = m(x_o) + \sigma(x_o) \, \epsilon_k
 
-    The noise is the same for all observations.
-
-    Args:
-        model: The model, whose networks are shared.
-        noise: :math:`\epsilon`, shape ``(S, l_z)``.
-        event_shape: Shape of one observation.
+    The noise :math:`\epsilon`, ``(S, l_z)``, is the same for all observations. The
+    networks are those of the model.
     """
 
     noise: Tensor
@@ -249,23 +178,12 @@ class OverLatents(OverDraws):
     @torch.no_grad()
     def embed(self, x: Tensor) -> Tensor:
         """Return the embeddings, ``(n, *event)`` to ``(n, S, l)``."""
-        size = self.condition_shape.numel()
-        num_rows = max(1, MAX_ENTRIES // (size * self.num_members))
-        num_draws = max(1, MAX_ENTRIES // size)
-        return torch.cat(
-            [
-                torch.cat(
-                    [self._block(rows, some) for some in self.noise.split(num_draws)],
-                    dim=1,
-                )
-                for rows in x.split(num_rows)
-            ]
-        )
-
-    def _block(self, x_o: Tensor, noise: Tensor) -> Tensor:
-        """Return the embeddings of some draws, ``(b, s, l)``."""
-        mean, log_variance = (moment[:, None] for moment in self.encoder(x_o))
-        z = drawn(mean, log_variance, noise).flatten(0, 1)
-        x_s, _ = self.reality_to_physics(x_o, z)
-        s = self.nets.answer(embedded, x_s)
-        return s.unflatten(0, (len(x_o), len(noise)))
+        count, parts = self.num_members, []
+        size = MAX_ENTRIES // (self.condition_shape.numel() * count)
+        for some in x.split(max(1, size)):
+            law = self.encoder(some)
+            z = law.mean[:, None] + law.stddev[:, None] * self.noise
+            x_s = self.reality_to_physics(some, z.flatten(0, 1)).mean
+            s = self.nets.answer(embedded, x_s)
+            parts.append(s.unflatten(0, (len(some), count)))
+        return torch.cat(parts)

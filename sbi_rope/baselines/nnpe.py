@@ -1,19 +1,12 @@
 """Noisy neural posterior estimation: NPE trained on statistics with errors."""
 
-import copy
-from typing import Any, Literal
+from typing import Any
 
-import torch
 from torch import Tensor
 
-from sbi_rope._sbi import embed, estimator_of, posterior_from
+from sbi_rope._sbi import embed, posterior_from
 from sbi_rope.baselines.error_model import SpikeAndSlab
-from sbi_rope.baselines.statistics import (
-    NoiseOn,
-    SoftClip,
-    split_at_statistics,
-    with_clip,
-)
+from sbi_rope.baselines.statistics import NoiseOn, clipped_statistics
 from sbi_rope.fit import History, Training
 from sbi_rope.settings import check
 from sbi_rope.trainers.base import Method
@@ -33,14 +26,14 @@ class NNPE(Method):
         + \tfrac12 \mathrm{Cauchy}(0, 0.25)
 
     in units of each statistic's standard deviation over the simulations. The statistics
-    are the embedding h(x) of NPE, which is kept as it is while the density is trained
-    on, or, where x is a list of statistics itself, its entries; then the embedding net
-    is trained on too. Training starts from NPE, and the noise is drawn anew for every
-    batch. A real observation is conditioned on directly.
+    are the embedding h(x) of NPE, which is kept as it is, or the entries of x; then the
+    embedding net is trained on too. Training starts from NPE, and the noise is drawn
+    anew for every batch. A real observation is conditioned on directly.
 
-    Sees simulations, also when it starts from a trained NPE. Assumes that statistics
-    err independently of each other, any of them, and by a few standard deviations
-    rather than by many. It is never as sharp as NPE where the simulator is right.
+    It sees simulations, also when it starts from a trained NPE. It assumes that
+    statistics err independently of each other, any of them, and by a few standard
+    deviations rather than by many. It is never as sharp as NPE where the simulator is
+    right.
 
     References:
         | Robust Neural Posterior Estimation and Statistical Model Criticism
@@ -52,14 +45,12 @@ class NNPE(Method):
         noise_on: Where the noise goes: ``"embedding"`` or ``"input"``.
         error_model: The noise; ``SpikeAndSlab()`` if None.
         training: How training goes on with noise; ``Training()`` if None.
-
-    Raises:
-        UnsupportedPosteriorError: In ``train``, if the estimator has no density.
     """
 
     sees = frozenset({"simulations"})
     starts_from_npe = True
     trains_on_statistics = True
+    default_training = Training()
 
     def __init__(
         self,
@@ -68,35 +59,27 @@ class NNPE(Method):
         *,
         noise_on: NoiseOn = "embedding",
         error_model: SpikeAndSlab | None = None,
-        npe_training: Training | None = None,
-        training: Training | None = None,
-        device: str | torch.device = "cpu",
+        **options: Any,
     ) -> None:
-        check("noise_on", noise_on, Literal["embedding", "input"])
-        super().__init__(prior, density_estimator, npe_training, device=device)
+        check("noise_on", noise_on, NoiseOn)
+        super().__init__(prior, density_estimator, **options)
         self.noise_on: NoiseOn = noise_on
         self.error_model = error_model or SpikeAndSlab()
-        self.training = training or Training()
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
-        estimator = copy.deepcopy(estimator_of(npe)).requires_grad_()
-        net, _ = split_at_statistics(estimator, self.noise_on)
         theta, x = self._data.simulations
-        statistics = embed(net, x)
-        clip = SoftClip(statistics)
-        density, estimator = with_clip(estimator, clip, self.noise_on)
-        scale = clip.std
+        net, clip, density, estimator = clipped_statistics(npe, self.noise_on, x)
 
         def with_noise(statistics: Tensor) -> Tensor:
-            return statistics + scale * self.error_model.sample_like(statistics)
+            return statistics + clip.std * self.error_model.sample_like(statistics)
 
         trained, history = train_on_simulations(
             self._prior,
             # sbi tries it on the CPU, and moves it to the data's device.
             lambda theta, x: density.cpu(),
             theta,
-            statistics,
+            embed(net, x),
             training=self.training,
             show_progress_bars=show_progress_bars,
             change_x=with_noise,  # anew in every batch

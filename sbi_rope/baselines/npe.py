@@ -13,10 +13,9 @@ from torch import Tensor
 
 from sbi_rope._random import seeded
 from sbi_rope.density import PriorPosterior
-from sbi_rope.fit import History, Training
+from sbi_rope.fit import History
 from sbi_rope.simulate import Simulated
 from sbi_rope.trainers.base import Method
-from sbi_rope.trainers.training import EstimatorBuilder
 
 __all__ = ["PlainNPE", "PriorBaseline", "ReferenceNPE"]
 
@@ -28,8 +27,7 @@ class PriorBaseline(Method):
     posterior probability has learnt less than nothing.
 
     Args:
-        prior: A torch distribution over parameters of shape ``(d,)``.
-        device: Where the prior lives.
+        prior, device: See :class:`Method`.
     """
 
     sees = frozenset()
@@ -45,9 +43,8 @@ class PlainNPE(Method):
         \min_q\; \mathbb{E}_{p(\theta)\, p(x_s \mid \theta)}
         \bigl[-\log q(\theta \mid h(x_s))\bigr]
 
-    A thin cover of ``sbi.inference.NPE``. It sees simulations, and assumes that the
-    simulator is right: nothing else here is as sharp then, and none is as wrong if it
-    is not.
+    It sees simulations, and assumes that the simulator is right: nothing else here is
+    as sharp then, and none is as wrong if it is not.
 
     References:
         | Automatic Posterior Transformation for Likelihood-free Inference
@@ -55,10 +52,7 @@ class PlainNPE(Method):
         | https://arxiv.org/abs/1905.07488
 
     Args:
-        prior: A torch distribution over parameters of shape ``(d,)``.
-        density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns.
-        npe_training: How NPE is trained; ``Training()`` if None.
-        device: Where to train; data on other devices is moved there.
+        prior, density_estimator, npe_training, device: See :class:`Method`.
 
     Example:
         >>> from sbi.utils import BoxUniform
@@ -74,16 +68,6 @@ class PlainNPE(Method):
 
     sees = frozenset({"simulations"})
     starts_from_npe = True
-
-    def __init__(
-        self,
-        prior: Any,
-        density_estimator: str | EstimatorBuilder = "nsf",
-        *,
-        npe_training: Training | None = None,
-        device: str | torch.device = "cpu",
-    ) -> None:
-        super().__init__(prior, density_estimator, npe_training, device=device)
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History | None]:
         return self._trained_npe(show_progress_bars=show_progress_bars)
@@ -101,22 +85,19 @@ class ReferenceNPE(PlainNPE):
     def simulated_test_set(
         self, theta: Tensor, simulator: Callable[[Any], Any], *, seed: int | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Return the test parameters, each with one simulation.
+        """Return test parameters ``(n, d)``, each with one simulation.
 
         Args:
-            theta: Test parameters, shape ``(n, d)``.
+            theta: Test parameters.
             simulator: Maps parameters to simulations, batched or not.
-            seed: Seed of the simulations; None uses the states of torch, NumPy and
-                Python.
+            seed: Seed of the simulations; None uses the present random state.
 
         Returns:
             Parameters and simulations, without those that are not finite.
         """
         theta = self._data.read_theta(theta)
-        event_shape = self._data.event_shape or torch.Size()
+        shape = self._data.event_shape or torch.Size()
         with seeded(seed):
-            x = Simulated(simulator, self._prior, event_shape=event_shape, like=theta)(
-                theta
-            )
+            x = Simulated(simulator, self._prior, event_shape=shape, like=theta)(theta)
         valid = torch.isfinite(x).flatten(1).all(dim=1)
         return theta[valid], x[valid]

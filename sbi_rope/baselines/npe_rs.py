@@ -10,11 +10,7 @@ from sbi_rope.errors import warn_user
 from sbi_rope.fit import History, Training
 from sbi_rope.settings import NotNegative, check
 from sbi_rope.trainers.base import Method
-from sbi_rope.trainers.training import (
-    EstimatorBuilder,
-    estimator_builder,
-    train_on_simulations,
-)
+from sbi_rope.trainers.training import EstimatorBuilder, train_on_simulations
 
 __all__ = ["NPERS", "squared_mmd"]
 
@@ -32,17 +28,13 @@ def squared_mmd(simulated: Tensor, observed: Tensor) -> Tensor:
         \qquad k(a, b) = \exp\Bigl(-\frac{\lVert a - b \rVert^2}
         {\operatorname{median}_{ij} \lVert s_i - s_j \rVert^2}\Bigr)
 
-    The biased estimate, never negative: pairs of an embedding with itself are counted,
-    in the median too. Gradients pass through the median. It does not change when all
-    embeddings are scaled by the same factor.
+    The embeddings are ``(m, l)`` and ``(n, l)``. This is the biased estimate, never
+    negative: pairs of an embedding with itself are counted, in the median too.
+    Gradients pass through the median.
 
     References:
         | A Kernel Two-Sample Test (Gretton et al., 2012), eq. 5
         | https://jmlr.org/papers/v13/gretton12a.html
-
-    Args:
-        simulated: Embeddings of simulations, shape ``(m, l)``.
-        observed: Embeddings of observations, shape ``(n, l)``.
     """
     within_simulated = _squared_distances(simulated, simulated)
     across = _squared_distances(simulated, observed)
@@ -74,20 +66,14 @@ class NPERS(Method):
 
     with the discrepancy ``squared_mmd``. Each gradient step draws anew, without
     replacement, 200 of all simulations and 200 of all observations for it, and embeds
-    them in evaluation mode: batch statistics are those of the simulations. When
-    to stop and which network to keep is decided by the first term alone, on held-out
-    simulations.
+    them in evaluation mode: batch statistics are those of the simulations. The first
+    term alone, on held-out simulations, decides when to stop and which network to keep.
 
-    Sees simulations and the observations to be inferred, no labels. Assumes that the
-    prior is right, and that some statistics of x are informative and not misspecified.
-    Where every informative statistic is wrong, matching the distributions says nothing
-    about which observation goes with which simulation, and the posterior is sharp
-    around the wrong value. Whatever regularises also costs likelihood of simulations,
-    so that keeping the network that is best by the latter favours the epochs in which
-    the embeddings have not met yet. The posterior answers for any x.
-
-    An estimator without an embedding net that can be trained has nothing to
-    regularise. The method is NPE then, and warns.
+    It sees simulations and the observations to be inferred, no labels. It assumes that
+    the prior is right, and that some statistics of x are informative and not
+    misspecified. Where every informative statistic is wrong, the posterior is sharp
+    around the wrong value. Without an embedding net that can be trained, the method is
+    NPE, and warns.
 
     References:
         | Learning Robust Statistics for Simulation-based Inference under Model
@@ -95,19 +81,14 @@ class NPERS(Method):
         | https://arxiv.org/abs/2305.15871
 
     Args:
-        prior: A torch distribution over parameters of shape ``(d,)``.
-        density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns, with an
-            embedding net. The net is copied, never trained in place.
+        prior, density_estimator, device: See :class:`Method`. The estimator should have
+            an embedding net.
         regularisation: The weight :math:`\beta`; at 0 the method is NPE.
         training: How it is trained; ``Training()`` if None.
-        device: Where to train; data on other devices is moved there.
-
-    Raises:
-        UnsupportedPosteriorError: In ``train``, if the embedding cannot be separated
-            from the density.
     """
 
     sees = frozenset({"simulations", "observations"})
+    default_training = Training()
 
     def __init__(
         self,
@@ -115,18 +96,14 @@ class NPERS(Method):
         density_estimator: str | EstimatorBuilder = "nsf",
         *,
         regularisation: float = 1.0,
-        training: Training | None = None,
-        device: str | torch.device = "cpu",
+        **options: Any,
     ) -> None:
         check("regularisation", regularisation, NotNegative)
-        super().__init__(prior, device=device)
-        self._build = estimator_builder(density_estimator)
+        super().__init__(prior, density_estimator, **options)
         self.regularisation = regularisation
-        self.training = training or Training()
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         theta, x = self._data.simulations
-
         estimator, history = train_on_simulations(
             self._prior,
             self._build,

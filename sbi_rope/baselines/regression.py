@@ -1,9 +1,5 @@
 r"""Regression of parameters on real observations, without a simulator."""
 
-from typing import Any
-
-import torch
-
 from sbi_rope.density import GaussianProcess, MixturePosterior
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.trainers.base import Method
@@ -24,8 +20,7 @@ class Regression(Method):
         | http://gaussianprocess.org/gpml, sections 2.2, 5.4.1 and 5.4.2
 
     Args:
-        prior: A torch distribution over parameters of shape ``(d,)``.
-        device: Where to compute; data on other devices is moved there.
+        prior, device: See :class:`Method`.
 
     Raises:
         InvalidInputError: In ``train``, if a parameter is the same in all pairs.
@@ -33,9 +28,6 @@ class Regression(Method):
 
     sees = frozenset({"calibration"})
     min_pairs = 2
-
-    def __init__(self, prior: Any, *, device: str | torch.device = "cpu") -> None:
-        super().__init__(prior, device=device)
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[MixturePosterior, None]:
         pairs = self._data.pairs

@@ -5,15 +5,12 @@ Data-driven Calibration (Wehenkel et al., 2025), section 4, Baselines,
 https://arxiv.org/abs/2405.08719.
 """
 
-from collections.abc import Callable
 from typing import Any
-
-import torch
 
 from sbi_rope.coupling import SinkhornCoupler
 from sbi_rope.density import MixturePosterior
 from sbi_rope.finetuning import CalibrationFinetuner
-from sbi_rope.fit import History, Training
+from sbi_rope.fit import History
 from sbi_rope.rope import RoPE
 from sbi_rope.trainers.base import Method
 from sbi_rope.trainers.training import EstimatorBuilder
@@ -27,14 +24,12 @@ class TuningOnly(Method):
     Step 2 of RoPE without step 3: :meth:`RoPE.tuned_posterior
     <sbi_rope.RoPE.tuned_posterior>`.
 
-    Sees simulations and the calibration set, and simulates at the calibration
-    parameters. Assumes that :math:`g(x_o)` lands on the embeddings of simulations; it
-    is sharp, and nothing tempers it where they do not.
+    It sees simulations and the calibration set, and simulates at the calibration
+    parameters. It assumes that :math:`g(x_o)` lands on the embeddings of simulations;
+    it is sharp, and nothing tempers it where they do not.
 
     Args:
-        prior, density_estimator, npe_training, device: See :class:`Method`.
-        simulator: Maps parameters to simulations, batched or not. Without one, the
-            targets come from the appended simulations with the nearest parameters.
+        prior, density_estimator, npe_training, simulator, device: See :class:`Method`.
         finetuner: Settings of the fine-tuning; ``CalibrationFinetuner()`` if None.
     """
 
@@ -47,14 +42,10 @@ class TuningOnly(Method):
         prior: Any,
         density_estimator: str | EstimatorBuilder = "nsf",
         *,
-        simulator: Callable[[Any], Any] | None = None,
         finetuner: CalibrationFinetuner | None = None,
-        npe_training: Training | None = None,
-        device: str | torch.device = "cpu",
+        **options: Any,
     ) -> None:
-        super().__init__(
-            prior, density_estimator, npe_training, simulator=simulator, device=device
-        )
+        super().__init__(prior, density_estimator, **options)
         self.finetuner = finetuner
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
@@ -76,13 +67,11 @@ class OTOnly(Method):
     Step 3 of RoPE without step 2, g = h. The posterior answers for the appended
     observations only.
 
-    Sees simulations and the observations to be inferred, no labels. Assumes that the
-    prior is right and that h orders real observations as it orders simulations.
+    It sees simulations and the observations to be inferred, no labels. It assumes that
+    the prior is right and that h orders real observations as it orders simulations.
 
     Args:
-        prior, density_estimator, npe_training, device: See :class:`Method`.
-        simulator: Maps parameters to simulations, batched or not. Without one, the
-            appended simulations are coupled with.
+        prior, density_estimator, npe_training, simulator, device: See :class:`Method`.
         coupler: Settings of the transport; ``SinkhornCoupler()`` if None.
         num_simulations: n_s; as many as there are observations, at least 1000, if None.
 
@@ -99,41 +88,23 @@ class OTOnly(Method):
         prior: Any,
         density_estimator: str | EstimatorBuilder = "nsf",
         *,
-        simulator: Callable[[Any], Any] | None = None,
         coupler: SinkhornCoupler | None = None,
         num_simulations: int | None = None,
-        npe_training: Training | None = None,
-        device: str | torch.device = "cpu",
+        **options: Any,
     ) -> None:
-        super().__init__(
-            prior, density_estimator, npe_training, simulator=simulator, device=device
-        )
+        super().__init__(prior, density_estimator, **options)
         self.coupler = coupler
         self.num_simulations = num_simulations
 
-    def build_rope(self) -> RoPE:
-        """Return the RoPE of a trained NPE without pairs, to couple at many settings.
-
-        The appended observations and ``coupler.gamma`` play no part in it.
-
-        Raises:
-            NotReadyError: If it needs simulations that were not appended.
-        """
-        if self.needs_simulations:
-            self._check_data("simulations")
-        return self._rope_of(self._given_npe)
-
-    def _rope_of(self, npe: Any) -> RoPE:
-        return RoPE(
+    def _fit(self, *, show_progress_bars: bool) -> tuple[MixturePosterior, Any]:
+        npe, history = self._trained_npe(show_progress_bars=show_progress_bars)
+        rope = RoPE(
             npe,
             simulator=self._simulator,
             simulations=self._looked_up,
             coupler=self.coupler,
         )
-
-    def _fit(self, *, show_progress_bars: bool) -> tuple[MixturePosterior, Any]:
-        npe, history = self._trained_npe(show_progress_bars=show_progress_bars)
-        posterior = self._rope_of(npe).build_posterior(
+        posterior = rope.build_posterior(
             self._data.observations,
             num_simulations=self.num_simulations,
             show_progress_bars=show_progress_bars,

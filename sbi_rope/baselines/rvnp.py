@@ -1,7 +1,6 @@
 r"""Robust variational neural posterior estimation (RVNP)."""
 
-import copy
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -15,18 +14,17 @@ from torch.distributions import (
 )
 
 from sbi_rope._random import seeded
-from sbi_rope._sbi import embed, estimator_of, gaussians_of, posterior_from
+from sbi_rope._sbi import embed, gaussians_of, posterior_from
 from sbi_rope._standardisation import Standardisation
+from sbi_rope.baselines.networks import fit_rows
 from sbi_rope.baselines.statistics import (
     NoiseOn,
-    SoftClip,
+    clipped_statistics,
     fit_with_jitter,
-    split_at_statistics,
     standardisation_of_statistics,
-    with_clip,
 )
 from sbi_rope.data import split_pairs
-from sbi_rope.fit import History, Training, fit, shuffled
+from sbi_rope.fit import History, Training
 from sbi_rope.settings import check
 from sbi_rope.tensors import as_batch
 from sbi_rope.trainers.base import Method
@@ -34,13 +32,6 @@ from sbi_rope.trainers.training import EstimatorBuilder
 
 __all__ = ["RVNP"]
 
-DEFAULT_TRAINING = Training(
-    training_batch_size=50,
-    learning_rate=1e-3,
-    stop_after_epochs=20,
-    max_num_epochs=200,
-    clip_max_norm=10.0,
-)
 # K, the share of the draws that come from the prior, and lambda.
 NUM_DRAWS, SHARE_OF_PRIOR, SHRINKAGE = 32, 0.25, 0.1
 # Units of each of the two hidden layers, as in the original code.
@@ -49,8 +40,7 @@ HIDDEN = 128
 NUM_COMPONENTS = 5
 # Standard deviation of the errors before training.
 START = 0.5
-# Noise on simulated statistics, without which those that depend on each other have no
-# density, and the smallest standard deviation of an error.
+# Noise on simulated statistics, and the smallest standard deviation of an error.
 JITTER, SMALLEST = 0.01, 1e-3
 
 
@@ -77,16 +67,11 @@ class RVNP(Method):
     follows the weighted draws, by minimising :math:`-\sum_k w_k \log q(\theta_k \mid
     y)` with :math:`w_k = v_k / \sum_j v_j`.
 
-    Sees simulations and observations without labels. It assumes that the parameters of
-    the observations follow the prior: an error is seen only by what it does to the
-    distribution of all observations, and errors that leave this distribution as it is,
-    such as an offset that a shift of all parameters would explain as well, are not
+    It sees simulations and observations without labels. It assumes that the parameters
+    of the observations follow the prior: an error is seen only by what it does to the
+    distribution of all observations. An error that leaves this distribution as it is,
+    such as an offset that a shift of all parameters would explain as well, is not
     found. It also assumes Gaussian errors, and at least some tens of observations.
-
-    The paper has two error models, the default here and RVNP-G, which is
-    ``depends_on_theta=False``. The offset, ``shift=True``, is part of what the code
-    calls its primary method. An offset can be taken for other parameters, so that it
-    helps only where the prior tells the two apart.
 
     References:
         | Robust Variational Neural Posterior Estimation for Simulation-Based Inference
@@ -99,7 +84,8 @@ class RVNP(Method):
             it is, or the ``"input"``, whose shape must be ``(l,)`` then.
         shift: Whether errors have an offset, :math:`\mu + \mu(\theta)`.
         depends_on_theta: Whether :math:`\mu(\theta)` and :math:`\sigma(\theta)` are
-            networks; otherwise :math:`\mu(\theta)` is zero and :math:`\sigma` constant.
+            networks; otherwise (RVNP-G) :math:`\mu(\theta)` is zero and
+            :math:`\sigma` constant.
         surrogate_training: How :math:`p(s \mid \theta)` is trained; ``Training()`` if
             None.
         training: How errors and posterior are trained, in batches of observations; at
@@ -107,12 +93,18 @@ class RVNP(Method):
 
     Raises:
         InvalidInputError: In ``train``, if no statistic varies or one is missing (NaN).
-        UnsupportedPosteriorError: In ``train``, if the estimator has no density.
     """
 
     sees = frozenset({"simulations", "observations"})
     starts_from_npe = True
     trains_on_statistics = True
+    default_training = Training(
+        training_batch_size=50,
+        learning_rate=1e-3,
+        stop_after_epochs=20,
+        max_num_epochs=200,
+        clip_max_norm=10.0,
+    )
 
     def __init__(
         self,
@@ -122,101 +114,68 @@ class RVNP(Method):
         noise_on: NoiseOn = "embedding",
         shift: bool = False,
         depends_on_theta: bool = True,
-        npe_training: Training | None = None,
         surrogate_training: Training | None = None,
-        training: Training | None = None,
-        device: str | torch.device = "cpu",
+        **options: Any,
     ) -> None:
-        check("noise_on", noise_on, Literal["embedding", "input"])
-        super().__init__(prior, density_estimator, npe_training, device=device)
+        check("noise_on", noise_on, NoiseOn)
+        super().__init__(prior, density_estimator, **options)
         self.noise_on: NoiseOn = noise_on
         self.shift = shift
         self.depends_on_theta = depends_on_theta
         self.surrogate_training = surrogate_training or Training()
-        self.training = training or DEFAULT_TRAINING
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
-        estimator = copy.deepcopy(estimator_of(npe)).requires_grad_()
-        net, _ = split_at_statistics(estimator, self.noise_on)
         theta, x = self._data.simulations
+        net, _, density, estimator = clipped_statistics(npe, self.noise_on, x)
         simulated, observed = embed(net, x), embed(net, self._data.observations)
         standardise = standardisation_of_statistics(simulated)
         observed = as_batch("statistics of x_o", observed)
-        clip = SoftClip(simulated)
-        density, estimator = with_clip(estimator, clip, self.noise_on)
-        s = standardise(simulated)
-        training = self.surrogate_training
+        s, y = standardise(simulated), standardise(observed)
         surrogate = fit_surrogate(
-            theta, s, training=training, show_progress_bars=show_progress_bars
+            theta,
+            s,
+            training=self.surrogate_training,
+            show_progress_bars=show_progress_bars,
         )
         errors = ErrorModel(
             theta, s.shape[1], shift=self.shift, depends_on_theta=self.depends_on_theta
         )
         bound = Bound(density, errors, surrogate, self._prior)
-        history = self._train(
-            bound,
-            observed,
-            standardise(observed),
-            show_progress_bars=show_progress_bars,
-        )
-        return posterior_from(npe, estimator.eval()), history
 
-    def _train(
-        self, bound: "Bound", statistics: Tensor, y: Tensor, *, show_progress_bars: bool
-    ) -> History:
+        def loss(rows: Tensor) -> Tensor:
+            evidence, cross_entropy, squared_shift = bound(observed[rows], y[rows])
+            return (cross_entropy - evidence).mean() + SHRINKAGE * squared_shift
+
         size = self.training.training_batch_size
         train, held_out = split_pairs(
             torch.arange(len(y)), self.training.validation_fraction
         )
-        scored = held_out if len(held_out) else train
 
-        def loss(rows: Tensor) -> Tensor:
-            terms = bound(statistics[rows], y[rows])
-            mean = (terms.cross_entropy - terms.log_evidence).mean()
-            return mean + SHRINKAGE * terms.squared_shift
-
-        def validation_loss() -> Tensor:
+        def validation_loss(held_out: Tensor) -> Tensor:
             # The same random numbers for all epochs, so that they can be compared.
             with seeded(0):
-                evidence = [
-                    bound(statistics[rows], y[rows]).log_evidence
-                    for rows in scored.split(size)
-                ]
-            return -torch.cat(evidence).mean()
+                parts = [bound(observed[r], y[r])[0] for r in held_out.split(size)]
+            return -torch.cat(parts).mean()
 
-        [history] = fit(
+        history = fit_rows(
             bound,
-            lambda epoch: zip(shuffled(train, size), strict=True),
             loss,
+            (train, held_out if len(held_out) else train),
             self.training,
             validation_loss=validation_loss,
             in_training_mode=False,
             label="RVNP",
             show_progress_bars=show_progress_bars,
         )
-        return history
-
-
-class Terms(NamedTuple):
-    """What a bound is made of, and what trains its parts."""
-
-    log_evidence: Tensor  # log p(y) of each observation, (n,)
-    cross_entropy: Tensor  # -sum_k w_k log q(theta_k | y) of each, (n,)
-    squared_shift: Tensor  # the mean of ||mu(theta)||^2 over all draws, ()
+        return posterior_from(npe, estimator.eval()), history
 
 
 class Bound(nn.Module):
     r"""The bound on the evidence of real statistics, with weighted draws of theta.
 
-    The mean of the logarithm is never above :math:`\log p(y)`.
-
-    Args:
-        q: The density of theta given statistics, which is trained.
-        errors: The error model, which is trained.
-        surrogate: The density of simulated statistics given theta.
-        prior: The prior.
-        num_draws: K.
+    The mean of the logarithm is never above :math:`\log p(y)`. The density q and the
+    error model are trained; ``num_draws`` is K.
     """
 
     def __init__(
@@ -235,9 +194,17 @@ class Bound(nn.Module):
         self.num_of_prior = max(1, round(SHARE_OF_PRIOR * num_draws))
         self.num_of_q = num_draws - self.num_of_prior
 
-    def forward(self, statistics: Tensor, y: Tensor) -> Terms:
-        """Return the terms at statistics ``(n, *)``, which are y if standardised."""
-        theta = self._draws(statistics)
+    def forward(self, statistics: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        r"""Return bounds and what trains q and the shift.
+
+        The statistics ``(n, *)`` are y if standardised. The bounds have the shape
+        ``(n,)``, as has :math:`-\sum_k w_k \log q(\theta_k \mid y)`. The third is the
+        mean of :math:`\lVert \mu(\theta) \rVert^2` over all draws.
+        """
+        with torch.no_grad():
+            of_q = self.q.sample(torch.Size((self.num_of_q,)), statistics)
+            shape = torch.Size((self.num_of_prior, len(statistics)))
+            theta = torch.cat([of_q, self.prior.sample(shape).to(of_q)])
         log_q = self.q.log_prob(theta, statistics).double()
         log_prior = self.prior.log_prob(theta).double()
         log_lik, of_mean = log_likelihood(
@@ -250,32 +217,20 @@ class Bound(nn.Module):
         )
         log_v = log_lik.unflatten(0, theta.shape[:2]) + log_prior - log_r
         weights = log_v.detach().softmax(dim=0)
-        return Terms(
+        cross_entropy = -(weights * log_q).sum(dim=0)
+        return (
             log_v.logsumexp(dim=0),
-            -(weights * log_q).sum(dim=0),
+            cross_entropy,
             of_mean.square().sum(dim=1).mean(),
         )
-
-    @torch.no_grad()
-    def _draws(self, statistics: Tensor) -> Tensor:
-        """Return draws of r for each observation, ``(K, n, d)``."""
-        of_q = self.q.sample(torch.Size((self.num_of_q,)), statistics)
-        shape = torch.Size((self.num_of_prior, len(statistics)))
-        return torch.cat([of_q, self.prior.sample(shape).to(of_q)])
 
 
 class ErrorModel(nn.Module):
     r"""By what a real statistic differs from a simulated one, given the parameters.
 
     It starts without an offset, with errors of half a standard deviation of the
-    simulated statistics; :math:`\Lambda` is strictly lower triangular.
-
-    Args:
-        theta: Parameters of simulations, shape ``(n, d)``, for their units.
-        size: Number of statistics, l.
-        shift: Whether there is an offset.
-        depends_on_theta: Whether :math:`\mu(\theta)` and :math:`\sigma(\theta)` are
-            networks.
+    simulated statistics; :math:`\Lambda` is strictly lower triangular. Parameters of
+    simulations tell the units of theta; ``size`` is the number l of statistics.
     """
 
     def __init__(
@@ -288,29 +243,26 @@ class ErrorModel(nn.Module):
         self.scale = nn.Parameter(start.expm1().log())  # of which softplus is START
         self.below = nn.Parameter(torch.zeros(size, size))
         self.shift = shift
-        self.net = self._net(theta) if depends_on_theta else None
+        self.net: nn.Module | None = None
+        if depends_on_theta:
+            unit, last = Standardisation(theta), nn.Linear(HIDDEN, 2 * size)
+            nn.init.zeros_(last.weight)
+            nn.init.zeros_(last.bias)
+            num_varying = int(unit.varies.sum())
+            self.net = nn.Sequential(
+                unit,
+                nn.Linear(num_varying, HIDDEN),
+                nn.Tanh(),
+                nn.Linear(HIDDEN, HIDDEN),
+                nn.Tanh(),
+                last,
+            )
         self.to(theta)
 
-    def _net(self, theta: Tensor) -> nn.Module:
-        unit = Standardisation(theta)
-        last = nn.Linear(HIDDEN, 2 * self.size)
-        nn.init.zeros_(last.weight)
-        nn.init.zeros_(last.bias)
-        return nn.Sequential(
-            unit,
-            nn.Linear(int(unit.varies.sum()), HIDDEN),
-            nn.Tanh(),
-            nn.Linear(HIDDEN, HIDDEN),
-            nn.Tanh(),
-            last,
-        )
-
     def forward(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        r"""Return the errors at parameters of shape ``(n, d)``.
+        r"""Return mean, :math:`\mu(\theta)` and covariance of the errors.
 
-        Returns:
-            Their mean, shape ``(n, l)``, the part :math:`\mu(\theta)` of it, and their
-            covariance, ``(n, l, l)``.
+        At parameters ``(n, d)`` these are ``(n, l)``, ``(n, l)`` and ``(n, l, l)``.
         """
         changes = theta.new_zeros(len(theta), 2 * self.size)
         if self.net is not None:
@@ -330,7 +282,6 @@ def fit_surrogate(
     surrogate = build(theta.cpu(), s.cpu()).to(s.device)
     fit_with_jitter(
         surrogate,
-        lambda rows, noisy: surrogate.loss(noisy, condition=theta[rows]),
         s,
         theta,
         jitter=JITTER,
@@ -352,15 +303,8 @@ def log_likelihood(
         S_c + L(\theta) L(\theta)^\top\bigr)
 
     with :math:`\pi_c, m_c, S_c` the weights, means and covariances of the surrogate.
-
-    Args:
-        surrogate: The density of simulated statistics.
-        errors: The error model.
-        y: Standardised real statistics, shape ``(n, l)``.
-        theta: Parameters, shape ``(n, d)``.
-
-    Returns:
-        The log densities, shape ``(n,)``, and :math:`\mu(\theta)`, shape ``(n, l)``.
+    The standardised y is ``(n, l)``, and theta ``(n, d)``. The log densities are
+    ``(n,)``; :math:`\mu(\theta)`, ``(n, l)``, comes second.
     """
     logits, means, covariances = gaussians_of(surrogate, theta)
     mean, of_mean, covariance = errors(theta)

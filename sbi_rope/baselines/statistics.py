@@ -1,7 +1,6 @@
 r"""The statistics that NNPE, RNPE and RVNP put errors on."""
 
 import copy
-from collections.abc import Callable
 from typing import Any, Literal
 
 import torch
@@ -9,39 +8,33 @@ from torch import Tensor, nn
 
 from sbi_rope._sbi import (
     ConditionalDensityEstimator,
-    UnconditionalDensityEstimator,
-    build_zuko_unconditional_flow,
     check_density,
+    embed,
     embedding_of,
     estimator_of,
     headless,
     with_embedding,
 )
 from sbi_rope._standardisation import Standardisation
+from sbi_rope.baselines.networks import fit_rows
 from sbi_rope.data import split_pairs
 from sbi_rope.density import Density, Flow
 from sbi_rope.ensemble import Ensemble, embedded, log_density
-from sbi_rope.fit import History, Training, fit, shuffled
+from sbi_rope.fit import History, Training
 from sbi_rope.tensors import as_batch
 
 __all__ = [
     "NoiseOn",
     "OverDraws",
     "SoftClip",
-    "fit_marginal",
+    "clipped_statistics",
     "fit_with_jitter",
     "frozen_statistics",
     "split_at_statistics",
     "standardisation_of_statistics",
-    "with_clip",
 ]
 
 NoiseOn = Literal["embedding", "input"]
-# Hidden units and transforms of the marginal density. A single spline transform is
-# evaluated in half the time of two, and the denoising does little else.
-HIDDEN, NUM_TRANSFORMS = 64, 1
-# Of the networks' outputs at the start.
-SHRINKAGE = 0.01
 # Where the logarithmic scale begins, in standard deviations, and the smallest of those.
 CLIP, SMALLEST = 3.0, 1e-20
 
@@ -72,13 +65,8 @@ class OverDraws(Flow):
 
     .. math:: \tfrac1K \sum_k q(\theta \mid s_k)
 
-    A subclass returns these from ``embed``, ``(n, *event)`` to ``(n, K, l)``.
-
-    Args:
-        net: A network that the subclass embeds with.
-        density: :math:`q(\theta \mid s)`.
-        num_draws: K.
-        event_shape: Shape of one observation.
+    A subclass returns these from ``embed``, ``(n, *event)`` to ``(n, K, l)``, with the
+    help of the net.
     """
 
     def __init__(
@@ -100,10 +88,7 @@ class OverDraws(Flow):
 
 
 def standardisation_of_statistics(statistics: Tensor) -> Standardisation:
-    """Return the map from statistics to standard deviations of these, ``(n, l)``.
-
-    They are refused if they are no vectors, or not finite.
-    """
+    """Return the map from vectors ``(n, l)`` to standard deviations of these."""
     return Standardisation(
         as_batch("statistics of x", statistics, statistics.shape[-1:])
     )
@@ -117,9 +102,9 @@ class SoftClip(nn.Module):
         \operatorname{sign}(z)\, c\, (1 + \log (|z| / c)) & |z| > c \end{cases}
 
     with z a statistic in standard deviations from its mean over simulations and c = 3.
-    It loses nothing and changes nothing where simulations are, but keeps networks from
-    inputs that are hundreds of times larger than those. Statistics that are the same
-    in all simulations stay at that value.
+    It changes nothing where simulations are, but keeps networks from inputs that are
+    hundreds of times larger. Statistics that are the same in all simulations stay at
+    that value.
     """
 
     mean: Tensor
@@ -140,92 +125,46 @@ class SoftClip(nn.Module):
         return statistics.where(z.abs() <= CLIP, self.mean + self.std * clipped)
 
 
-def with_clip(estimator: Any, clip: SoftClip, noise_on: NoiseOn) -> tuple[Any, Any]:
-    r"""Return :math:`q(\theta \mid s)` and :math:`q(\theta \mid x)` that clip s.
+def clipped_statistics(
+    npe: Any, noise_on: NoiseOn, x: Tensor
+) -> tuple[nn.Module, SoftClip, Any, Any]:
+    r"""Return what a copy of NPE that clips its statistics s is made of.
 
-    Both share their parameters with the estimator, and are the same if s is x.
+    Returns:
+        The map from x to s; their clip by simulations x; :math:`q(\theta \mid s)` and
+        :math:`q(\theta \mid x)`, which clip s, share their parameters, and are the same
+        if s is x.
     """
+    estimator = copy.deepcopy(estimator_of(npe)).requires_grad_()
     net, density = split_at_statistics(estimator, noise_on)
+    clip = SoftClip(embed(net, x))
     density = with_embedding(density, nn.Sequential(clip, embedding_of(density)))
     if noise_on == "input":
-        return density, density
-    return density, with_embedding(estimator, nn.Sequential(net, clip))
-
-
-def fit_marginal(
-    s: Tensor, *, jitter: float, training: Training, show_progress_bars: bool
-) -> tuple[UnconditionalDensityEstimator, History]:
-    r"""Fit a neural spline flow :math:`q(s)` to standardised simulated statistics.
-
-    It starts as a standard normal density and stays like it where there are no
-    simulations, which is where misspecified statistics are. The jitter is the standard
-    deviation of Gaussian noise on s, without which statistics that depend on each other
-    have no density.
-    """
-    flow = build_zuko_unconditional_flow(
-        "NSF",
-        s.cpu(),
-        z_score_x="none",
-        hidden_features=[HIDDEN, HIDDEN],
-        num_transforms=NUM_TRANSFORMS,
-    )
-    _start_as_standard_normal(flow)
-    flow = flow.to(s.device)
-    history = fit_with_jitter(
-        flow,
-        lambda rows, noisy: flow.loss(noisy),
-        s,
-        torch.arange(len(s)),
-        jitter=jitter,
-        training=training,
-        label="Density of the statistics",
-        show_progress_bars=show_progress_bars,
-    )
-    return flow, history
+        return net, clip, density, density
+    return net, clip, density, with_embedding(estimator, nn.Sequential(net, clip))
 
 
 def fit_with_jitter(
-    density: nn.Module,
-    losses: Callable[[Tensor, Tensor], Tensor],
+    density: Any,
     s: Tensor,
-    groups: Tensor,
+    theta: Tensor | None,
     *,
     jitter: float,
     training: Training,
-    label: str,
-    show_progress_bars: bool,
+    **options: Any,
 ) -> History:
-    """Train a density of statistics with Gaussian noise on them, anew in every batch.
+    r"""Train a density of statistics, given theta if there is one.
 
-    The losses are those at some rows and their noisy statistics. Rows of a group are
-    held out together.
+    Gaussian noise on them is drawn anew for every batch; ``jitter`` is its standard
+    deviation. Without noise, statistics that depend on each other have no density.
+    Other options are those of :func:`~sbi_rope.fit.fit`.
     """
-    train, held_out = split_pairs(groups, training.validation_fraction)
 
     def loss(rows: Tensor) -> Tensor:
-        return losses(rows, s[rows] + jitter * torch.randn_like(s[rows])).mean()
+        noisy = s[rows] + jitter * torch.randn_like(s[rows])
+        given = {} if theta is None else {"condition": theta[rows]}
+        return density.loss(noisy, **given).mean()
 
-    [history] = fit(
-        density,
-        lambda epoch: zip(shuffled(train, training.training_batch_size), strict=True),
-        loss,
-        training,
-        validation_loss=(lambda: loss(held_out)) if len(held_out) else None,
-        label=label,
-        show_progress_bars=show_progress_bars,
-    )
-    return history
-
-
-@torch.no_grad()
-def _start_as_standard_normal(flow: nn.Module) -> None:
-    """Shrink the outputs of the networks, at zero of which splines are the identity."""
-    for module in flow.modules():
-        outputs: nn.Module | None = None
-        if isinstance(module, nn.Sequential) and isinstance(module[-1], nn.Linear):
-            outputs = module[-1]
-        elif isinstance(module, nn.ParameterList):
-            outputs = module  # a single statistic, with no network
-        if outputs is not None:
-            for parameter in outputs.parameters():
-                parameter.mul_(SHRINKAGE)
+    groups = torch.arange(len(s)) if theta is None else theta
+    split = split_pairs(groups, training.validation_fraction)
+    return fit_rows(density, loss, split, training, **options)

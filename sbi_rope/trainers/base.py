@@ -27,7 +27,11 @@ from sbi_rope.fit import History, Training
 from sbi_rope.settings import check
 from sbi_rope.simulate import Source, source_of
 from sbi_rope.tensors import as_batch, check_in_support, column_names, rows_with
-from sbi_rope.trainers.training import estimator_builder, train_on_simulations
+from sbi_rope.trainers.training import (
+    EstimatorBuilder,
+    estimator_builder,
+    train_on_simulations,
+)
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -144,7 +148,8 @@ class Method(ABC):
     that calls can be chained.
 
     A subclass says which data it ``sees`` and returns a posterior from ``_fit``. Data
-    that do not fit raise an ``InvalidInputError``, and nothing is added then.
+    that do not fit raise an ``InvalidInputError``, and nothing is added then. Options
+    that a method has no use for raise a ``TypeError``.
 
     Attributes:
         sees: The kinds of data that can be appended.
@@ -155,14 +160,24 @@ class Method(ABC):
         simulates: Whether it makes simulations of its own. Without a simulator it looks
             them up among those that were appended.
         min_pairs: The number of calibration pairs that it needs, if it sees them.
+        default_training: How its own networks are trained; None if it has none.
 
     Args:
         prior: A torch distribution over parameters of shape ``(d,)``.
-        density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns, of a
-            method that starts from NPE.
-        npe_training: How NPE is trained; ``Training()`` if None.
-        simulator: Maps parameters to simulations, of a method that simulates.
+        density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns. An
+            embedding net inside it is copied, never trained in place.
+        npe_training: How NPE is trained, for a method that starts from it;
+            ``Training()`` if None.
+        training: How the networks of the method itself are trained; its
+            ``default_training`` if None.
+        simulator: Maps parameters to simulations, batched or not, for a method that
+            simulates. Without one, appended simulations take its place; those at given
+            parameters are the ones with the nearest parameters.
         device: Where to train; data on other devices is moved there.
+
+    Raises:
+        UnsupportedPosteriorError: In ``train``, if the method needs a density and the
+            estimator has none, or if its embedding cannot be separated.
     """
 
     sees: ClassVar[frozenset[Kind]]
@@ -170,25 +185,35 @@ class Method(ABC):
     trains_on_statistics: ClassVar[bool] = False
     simulates: ClassVar[bool] = False
     min_pairs: ClassVar[int] = 1
+    default_training: ClassVar[Training | None] = None
 
     def __init__(
         self,
         prior: Any,
-        density_estimator: Any = None,
+        density_estimator: str | EstimatorBuilder = "nsf",
         npe_training: Training | None = None,
         *,
+        training: Training | None = None,
         simulator: Callable[[Any], Any] | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
+        for name, value, is_used in (
+            ("npe_training", npe_training, self.starts_from_npe),
+            ("training", training, self.default_training),
+            ("simulator", simulator, self.simulates),
+        ):
+            if value is not None and not is_used:
+                raise TypeError(f"{type(self).__name__} has no use for `{name}`.")
+        check("npe_training", npe_training, Training | None)
+        check("training", training, Training | None)
         self._prior = PriorDistribution(prior)
         self._device = torch.empty(0, device=device).device  # with its number
         self._prior.to(self._device)
         self._data = Data(self._prior, self._device)
         self._given_npe: Any = None
-        if self.starts_from_npe:
-            check("npe_training", npe_training, Training | None)
-            self._build = estimator_builder(density_estimator)
-            self._npe_training = npe_training or Training()
+        self._build = estimator_builder(density_estimator)
+        self._npe_training = npe_training or Training()
+        self.training: Any = training or self.default_training
         self._simulator = simulator
         self._posterior: Any = None
         self._history: History | None = None

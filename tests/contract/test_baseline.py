@@ -1,10 +1,10 @@
 """Every baseline keeps one contract: data goes in, a posterior of sbi comes out."""
 
 import copy
+import inspect
 import pickle
 import random
 import warnings
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import within_support
-from torch import Tensor, nn
+from torch import Size, Tensor, nn
 
+import sbi_rope.baselines
 from sbi_rope import load, save
-from sbi_rope.baselines import CalibrationMLP, Regression
+from sbi_rope._random import seeded
+from sbi_rope.baselines import CalibrationMLP, Method, PlainNPE, Regression
 from sbi_rope.density import MixturePosterior
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import InvalidInputError, NotReadyError, RoPEError, RoPEWarning
@@ -23,6 +25,7 @@ from sbi_rope.trainers.base import Kind
 from tests import baselines, problems
 from tests.baselines import (
     METHODS,
+    SHORT,
     append,
     data_of,
     densities,
@@ -32,7 +35,6 @@ from tests.baselines import (
     log_prob,
     log_prob_batched,
     make,
-    names_that_see,
     result,
     sample,
     sample_batched,
@@ -69,23 +71,64 @@ ONE_OF_A_KIND = (
     "nnpe",
     "rnpe",
 )
+every_method = pytest.mark.parametrize("name", METHODS)
 
 
-@pytest.fixture(params=METHODS)
-def name(request: pytest.FixtureRequest) -> str:
-    return request.param
+# Which data a method sees.
+
+SEES = {
+    "CalibrationMLP": {"calibration"},
+    "DiscrepancyNPE": {"simulations", "calibration"},
+    "FMCPE": {"simulations", "calibration"},
+    "FRISBI": {"simulations", "calibration", "observations"},
+    "FinetunedNPE": {"simulations", "calibration"},
+    "HVAE": {"simulations", "calibration", "observations"},
+    "JointNPE": {"simulations", "calibration"},
+    "NNPE": {"simulations"},
+    "NPERS": {"simulations", "observations"},
+    "OTOnly": {"simulations", "observations"},
+    "PlainNPE": {"simulations"},
+    "PriorBaseline": set(),
+    "RNPE": {"simulations"},
+    "RVNP": {"simulations", "observations"},
+    "ReferenceNPE": {"simulations"},
+    "Regression": {"calibration"},
+    "TuningOnly": {"simulations", "calibration"},
+}
 
 
-def retrained(name: str, data: baselines.Data | None = None, **options: Any) -> Any:
-    """The posterior of a new training with the seed of the cached one."""
-    data = data_of(first_task(name)) if data is None else data
-    return train(feed(make(name, first_task(name), **options), data)).build_posterior()
+def test_every_method_is_held_to_this_contract_and_sees_what_it_says() -> None:
+    public = [getattr(sbi_rope.baselines, name) for name in sbi_rope.baselines.__all__]
+    kinds = {kind for kind in public if inspect.isclass(kind)} | {DiscrepancyNPE}
+    methods = {k for k in kinds if issubclass(k, Method) and k is not Method}
+    assert methods == {entry.kind for entry in METHODS.values()}
+    assert {kind.__name__: set(kind.sees) for kind in methods} == SEES
+    # All take data and train as their common base does, and none takes labels of
+    # observations.
+    shared = {f"append_{kind}" for kind in KINDS} | {"train", "build_posterior"}
+    assert not any(shared & vars(kind).keys() for kind in methods)
+    assert list(inspect.signature(Method.append_observations).parameters)[1:] == ["x_o"]
+
+
+def test_data_that_are_missing_or_not_seen_are_named() -> None:
+    for name, entry in METHODS.items():
+        data = data_of(first_task(name))
+        for kind in KINDS:
+            method = make(name, first_task(name))
+            if kind not in entry.kind.sees:
+                with pytest.raises(InvalidInputError, match="a method that sees"):
+                    append(method, kind, data)
+                continue
+            feed(method, data, without=kind)
+            with pytest.raises(NotReadyError, match=rf"append_{kind}\("):
+                method.train(seed=0, show_progress_bars=False)
 
 
 # What comes out.
 
 
 @pytest.mark.medium
+@every_method
 def test_samples_and_densities_have_the_shapes_of_sbi(name: str) -> None:
     posterior, data = result(name), data_of(first_task(name))
     dim = data.theta.shape[1]
@@ -112,43 +155,29 @@ def test_samples_and_densities_have_the_shapes_of_sbi(name: str) -> None:
         single = log_prob(posterior, theta[:, i], data.x_o[i])
         assert torch.allclose(single, values[:, i], atol=tolerance)
 
-    if name not in ("prior", "regression"):
-        estimator = posterior.posterior_estimator
-        assert estimator.condition_shape == data.x_o.shape[1:]
-        assert estimator.input_shape == data.theta.shape[1:]
-        assert not estimator.training
-
 
 NUM_POINTS, STEP = 121, 0.15
 
 
-@pytest.fixture(scope="module")
-def grid() -> Tensor:
-    """Points of two dimensions that hold all mass of short trainings."""
-    axis = torch.linspace(-9, 9, NUM_POINTS)
-    return torch.cartesian_prod(axis, axis)
-
-
 @pytest.mark.medium
 @pytest.mark.parametrize("name", ONE_OF_A_KIND)
-def test_the_density_integrates_to_one_and_is_that_of_the_samples(
-    name: str, grid: Tensor
-) -> None:
+def test_the_density_integrates_to_one_and_is_that_of_the_samples(name: str) -> None:
     """By the rectangle rule, to 1 %; marginals by Kolmogorov and Smirnov, at 0.1 %."""
     posterior, x = result(name, "linear_gaussian"), data_of("linear_gaussian").x_o[1]
+    axis = torch.linspace(-9, 9, NUM_POINTS)
+    grid = torch.cartesian_prod(axis, axis)
     with torch.no_grad():
         mass = STEP**2 * log_prob(posterior, grid, x).double().exp()
     assert float(mass.sum()) == pytest.approx(1, abs=0.01)
     samples = sample(posterior, (2000,), x).double()
     for k in range(2):
         marginal = mass.reshape(NUM_POINTS, NUM_POINTS).sum(dim=1 - k)
-        edges = torch.linspace(-9, 9, NUM_POINTS).double() + STEP / 2
-        below = (samples[:, k, None] <= edges).double().mean(dim=0)
+        below = (samples[:, k, None] <= axis + STEP / 2).double().mean(dim=0)
         assert float((below - marginal.cumsum(0)).abs().max()) < 1.95 / 2000**0.5
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("name", ONE_OF_A_KIND)
+@pytest.mark.parametrize("name", [*ONE_OF_A_KIND, "fmcpe", "frisbi"])
 def test_inside_a_bounded_prior_is_the_mass_that_the_samples_have_there(
     name: str,
 ) -> None:
@@ -156,12 +185,9 @@ def test_inside_a_bounded_prior_is_the_mass_that_the_samples_have_there(
     task = "light_tunnel_sensors"
     if not task_of(task).has_data:
         pytest.skip(f"the data of {task} are not on this machine")
-    posterior, x, prior = (
-        result(name, task),
-        data_of(task).x_o[0],
-        task_of(task).get_prior(),
-    )
-    theta = prior.sample(torch.Size((20_000,)))
+    posterior, x = result(name, task), data_of(task).x_o[0]
+    prior = task_of(task).get_prior()
+    theta = prior.sample(Size((20_000,)))
     with torch.no_grad():
         log_weights = log_prob(posterior, theta, x) - prior.log_prob(theta)
     weights = log_weights.double().exp()
@@ -178,43 +204,27 @@ def test_inside_a_bounded_prior_is_the_mass_that_the_samples_have_there(
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("name", [*ONE_OF_A_KIND, "hvae"])
-def test_a_copy_of_the_posterior_has_the_same_density(name: str) -> None:
-    posterior, expected = result(name), expected_densities(name)
-    for copied in (copy.deepcopy(posterior), pickle.loads(pickle.dumps(posterior))):
-        assert torch.equal(densities(copied, name), expected)
-
-
-@pytest.mark.medium
 @pytest.mark.parametrize("name", [*ONE_OF_A_KIND, "fmcpe", "frisbi", "hvae"])
-def test_the_posterior_can_be_saved(name: str, tmp_path: Path) -> None:
+def test_a_posterior_that_is_copied_saved_or_moved_has_the_same_density(
+    name: str, tmp_path: Path
+) -> None:
     posterior, expected = result(name), expected_densities(name)
+    assert posterior is not result(name)  # each that is built is one's own
     save(posterior, tmp_path / "posterior.pt")
-    loaded = load(tmp_path / "posterior.pt")
-    assert type(loaded) is type(posterior)
-    assert torch.equal(densities(loaded, name), expected)
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize("name", [*ONE_OF_A_KIND, "hvae"])
-def test_the_posterior_can_be_moved(name: str) -> None:
-    # Not on the first task: sbi moves no posterior whose prior is torch's own.
+    for other in (
+        copy.deepcopy(posterior),
+        pickle.loads(pickle.dumps(posterior)),
+        load(tmp_path / "posterior.pt"),
+    ):
+        assert type(other) is type(posterior)
+        assert torch.equal(densities(other, name), expected)
     task = METHODS[name].tasks[-1]
-    if not task_of(task).has_data:
-        pytest.skip(f"the data of {task} are not on this machine")
-    posterior = result(name, task)
-    expected = densities(posterior, name, task)
+    if task == "linear_gaussian" or not task_of(task).has_data:
+        return  # sbi moves no posterior whose prior is torch's own
+    posterior, expected = result(name, task), expected_densities(name, task)
     posterior.to("cpu")
     assert torch.equal(densities(posterior, name, task), expected)
     assert sample(posterior, (3,), data_of(task).x_o[0]).isfinite().all()
-
-
-@pytest.mark.parametrize("name", FAST)
-def test_each_posterior_that_is_built_is_ones_own(name: str) -> None:
-    first, second = result(name), result(name)
-    assert first is not second
-    first.set_default_x(data_of(first_task(name)).x_o[:1])
-    assert second.default_x is None
 
 
 # Training.
@@ -222,14 +232,11 @@ def test_each_posterior_that_is_built_is_ones_own(name: str) -> None:
 
 def states() -> tuple[bytes, str, Any]:
     numpy_state = np.random.get_state()  # noqa: NPY002
-    return (
-        torch.get_rng_state().numpy().tobytes(),
-        str(numpy_state),
-        random.getstate(),
-    )
+    return torch.get_rng_state().numpy().tobytes(), str(numpy_state), random.getstate()
 
 
 @pytest.mark.medium
+@every_method
 def test_the_seed_alone_decides_and_training_leaves_no_trace(
     name: str, terminal: pytest.CaptureFixture[str]
 ) -> None:
@@ -263,56 +270,59 @@ def test_the_seed_alone_decides_and_training_leaves_no_trace(
         assert torch.equal(value, getattr(data_of(task), field))
 
 
+@pytest.mark.medium
+@pytest.mark.parametrize(
+    "name", [name for name, entry in METHODS.items() if entry.kind.starts_from_npe]
+)
+def test_a_posterior_trained_beforehand_does_as_well_and_is_not_changed(
+    name: str,
+) -> None:
+    task = first_task(name)
+    data = data_of(task)
+    npe = PlainNPE(
+        task_of(task).get_prior(), baselines.builder(task), npe_training=SHORT
+    )
+    npe.append_simulations(data.theta, data.x)
+    options = dict(METHODS[name].options(task_of(task)))
+    options.pop("npe_training")
+    with seeded(0):
+        given = train(npe, seed=None).build_posterior()
+        state = torch.get_rng_state()
+        weights = copy.deepcopy(given.posterior_estimator.state_dict())
+        method = feed(METHODS[name].kind.from_posterior(given, **options), data)
+        torch.set_rng_state(state)
+        posterior = train(method, seed=None).build_posterior()
+    assert torch.equal(densities(posterior, name), expected_densities(name))
+    after = given.posterior_estimator
+    assert all(torch.equal(weights[k], v) for k, v in after.state_dict().items())
+    assert all(p.grad is None for p in after.parameters())
+    with pytest.raises(InvalidInputError, match=r"`x` of shape"):
+        method.append_simulations(data.theta, torch.cat([data.x, data.x], dim=-1))
+
+
+# What is appended.
+
+
 @pytest.mark.parametrize(("name", "kind"), APPENDED)
 def test_data_appended_after_the_training_ask_for_another(
     name: str, kind: Kind
 ) -> None:
     method = copy.deepcopy(trained(name, first_task(name)))
     append(method, kind, data_of(first_task(name)))
-    with pytest.raises(NotReadyError, match=r"train\(\)"):
-        method.build_posterior()
-    with pytest.raises(NotReadyError):
-        _ = method.history
-
-
-def test_missing_data_are_asked_for_by_the_call_that_takes_them() -> None:
-    for name, entry in METHODS.items():
-        for kind in entry.kind.sees:
-            method = make(name, first_task(name))
-            feed(method, data_of(first_task(name)), without=kind)
-            with pytest.raises(NotReadyError, match=rf"append_{kind}\("):
-                method.train(seed=0, show_progress_bars=False)
-
-
-# What is appended.
+    for ask in (method.build_posterior, lambda: method.history):
+        with pytest.raises(NotReadyError):
+            ask()
 
 
 @pytest.mark.parametrize("name", FAST)
-class TestWhatIsAppended:
-    def test_in_two_parts_is_the_same_as_in_one(self, name: str) -> None:
-        data, method = data_of(first_task(name)), make(name, first_task(name))
-        feed(method, data.map(lambda value: value[:12]))
-        feed(method, data.map(lambda value: value[12:]))
-        posterior = train(method).build_posterior()
-        assert torch.equal(densities(posterior, name), expected_densities(name))
-
-    def test_may_change_afterwards(self, name: str) -> None:
-        data = data_of(first_task(name)).map(torch.clone)
-        method = feed(make(name, first_task(name)), data)
-        for value in vars(data).values():
-            value.fill_(0.25)
-        posterior = train(method).build_posterior()
-        assert torch.equal(densities(posterior, name), expected_densities(name))
-
-
-@pytest.mark.parametrize("kind", ["simulations", "calibration"])
-def test_parameters_outside_the_prior_are_refused(kind: Kind) -> None:
-    data = data_of("pendulum")
-    outside = replace(data, theta=data.theta + 1e4, theta_cal=data.theta_cal + 1e4)
-    prior = task_of("pendulum").get_prior()
-    method = baselines.JointNPE(prior, baselines.builder("pendulum"))
-    with pytest.raises(InvalidInputError, match="`theta` inside the support"):
-        append(method, kind, outside)
+def test_what_is_appended_is_copied_and_may_come_in_parts(name: str) -> None:
+    data, method = data_of(first_task(name)), make(name, first_task(name))
+    for part in (slice(12), slice(12, None)):
+        own = data.map(lambda value, part=part: value[part].clone())
+        feed(method, own)
+        own.map(lambda value: value.fill_(0.25))
+    posterior = train(method).build_posterior()
+    assert torch.equal(densities(posterior, name), expected_densities(name))
 
 
 @pytest.mark.parametrize(("name", "kind"), APPENDED)
@@ -326,33 +336,19 @@ def test_what_is_refused_is_not_appended(name: str, kind: Kind) -> None:
     assert torch.equal(densities(posterior, name), expected_densities(name))
 
 
-# Options.
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize(
-    "name",
-    ["tuning_only", "calibration_mlp", "discrepancy_tuned", "npe_rs", "nnpe", "rnpe"],
-)
-def test_the_density_estimator_can_do_without_an_embedding_net(name: str) -> None:
-    density_estimator = baselines.builder(first_task(name), net=nn.Identity())
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RoPEWarning)
-        posterior = retrained(name, density_estimator=density_estimator)
-    assert densities(posterior, name).isfinite().all()
-
-
-# Data that are few or broken.
-
-# Few pairs: the discrepancy learns alike from them in each space.
-WITH_PAIRS = [n for n in names_that_see("calibration") if n != "discrepancy_input"]
+@pytest.mark.parametrize("kind", ["simulations", "calibration"])
+def test_parameters_outside_the_prior_are_refused(kind: Kind) -> None:
+    outside = data_of("pendulum").map(lambda value: value + 1e4)
+    prior = task_of("pendulum").get_prior()
+    method = baselines.JointNPE(prior, baselines.builder("pendulum"))
+    with pytest.raises(InvalidInputError, match="`theta` inside the support"):
+        append(method, kind, outside)
 
 
 @pytest.mark.parametrize("name", FAST)
 def test_simulations_with_nan_are_dropped_with_a_warning(name: str) -> None:
     data, method = data_of(first_task(name)), make(name, first_task(name))
     x = torch.cat([data.x[:7], data.x[:2] * torch.nan, data.x[7:]])
-    x[8].flatten()[0] = torch.inf
     theta = torch.cat([data.theta[:7], data.theta[:2], data.theta[7:]])
     feed(method, data, without="simulations")
     with pytest.warns(RoPEWarning, match="Dropped 2 of 102 simulations"):
@@ -361,32 +357,47 @@ def test_simulations_with_nan_are_dropped_with_a_warning(name: str) -> None:
     assert torch.equal(densities(posterior, name), expected_densities(name))
 
 
-@pytest.mark.medium
-@pytest.mark.parametrize("name", WITH_PAIRS)
-def test_one_calibration_pair_is_enough_with_a_warning(name: str) -> None:
-    data, method = data_of(first_task(name)), make(name, first_task(name))
-    feed(method, data, without="calibration")
-    method.append_calibration(data.theta_cal[:1], data.x_cal[:1])
-    # One has nothing else to standardise by, and one learns an error from two.
-    if isinstance(method, CalibrationMLP | DiscrepancyNPE | Regression):
-        with pytest.raises(RoPEError, match="at least 2 calibration pairs"):
-            train(method)
-        return
-    with pytest.warns(RoPEWarning, match="1 calibration pair"):
-        train(method)
-    assert densities(method.build_posterior(), name).isfinite().all()
+# Few pairs, and no embedding net.
 
 
 @pytest.mark.medium
 @pytest.mark.parametrize(
-    "name", [n for n in WITH_PAIRS if not n.startswith(("discrepancy", "regression"))]
+    "name",
+    ["tuning_only", "calibration_mlp", "discrepancy_tuned", "npe_rs", "nnpe", "rnpe"],
 )
-def test_recordings_of_four_people_leave_none_to_hold_out(name: str) -> None:
-    data, method = data_of(first_task(name)), make(name, first_task(name))
-    feed(method, data, without="calibration")
-    method.append_calibration(data.theta_cal[:4].repeat(5, 1), data.x_cal)
-    with pytest.warns(
-        RoPEWarning, match=r"Only 4 different parameters \(or groups\) among 20"
-    ):
-        train(method)
-    assert densities(method.build_posterior(), name).isfinite().all()
+def test_the_density_estimator_can_do_without_an_embedding_net(name: str) -> None:
+    task = first_task(name)
+    density_estimator = baselines.builder(task, net=nn.Identity())
+    method = feed(make(name, task, density_estimator=density_estimator), data_of(task))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RoPEWarning)
+        posterior = train(method).build_posterior()
+        assert densities(posterior, name).isfinite().all()
+
+
+def with_pairs(name: str, theta: Tensor, x: Tensor) -> Method:
+    method = make(name, first_task(name))
+    feed(method, data_of(first_task(name)), without="calibration")
+    return method.append_calibration(theta, x)
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("name", baselines.names_that_see("calibration"))
+def test_few_pairs_are_enough_with_a_warning(name: str) -> None:
+    data = data_of(first_task(name))
+    one = with_pairs(name, data.theta_cal[:1], data.x_cal[:1])
+    # One has nothing else to standardise by, and one learns an error from two.
+    if isinstance(one, CalibrationMLP | DiscrepancyNPE | Regression):
+        with pytest.raises(RoPEError, match="at least 2 calibration pairs"):
+            train(one)
+    else:
+        with pytest.warns(RoPEWarning, match="1 calibration pair"):
+            train(one)
+        assert densities(one.build_posterior(), name).isfinite().all()
+    if isinstance(one, DiscrepancyNPE | Regression):
+        return
+    # Recordings of four people leave none to hold out.
+    four = with_pairs(name, data.theta_cal[:4].repeat(5, 1), data.x_cal)
+    with pytest.warns(RoPEWarning, match="Only 4 different parameters"):
+        train(four)
+    assert densities(four.build_posterior(), name).isfinite().all()

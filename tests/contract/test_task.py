@@ -6,6 +6,7 @@ arguments of the simulators are tried in ``tests/integration/test_bad_inputs.py`
 """
 
 import copy
+import math
 import pickle
 import warnings
 from collections.abc import Iterator
@@ -13,8 +14,6 @@ from contextlib import contextmanager
 
 import pytest
 import torch
-from sbi.inference import DirectPosterior, simulate_for_sbi
-from sbi.neural_nets import posterior_nn
 from sbi.utils import within_support
 from sbi.utils.user_input_checks import process_prior
 
@@ -120,6 +119,30 @@ def test_density_spread_and_quantiles_of_the_prior_are_those_of_its_draws(
             assert (prior.log_prob(outside) == -torch.inf).all()
 
 
+ALPHA = [0.5, 0.1]  # with the density of Malus' law at uniform angles
+ANALYTIC: dict[str, tuple[list[list[float]], list[float]]] = {
+    "cs": ([[850.0, 11.5, 15.0]], [-math.log(1300 * 17 * 10)]),
+    "light_tunnel": (
+        [[0.0, 254.0, 100.0, ALPHA[0]], [1.0, 2.0, 3.0, ALPHA[1]]],
+        [-3 * math.log(255) - math.log(math.pi * (a - a * a) ** 0.5) for a in ALPHA],
+    ),
+    "light_tunnel_sensors": (
+        [[0.0, 85.0, 42.0, 0.0], [0.0, 85.0, 42.0, 30.0]],
+        [-3 * math.log(86) + math.log(2 * (40 - d) / 1600) for d in (0, 30)],
+    ),
+    "pendulum": ([[0.1, 1.0]], [-math.log(28.5)]),
+    "sir": ([[0.4, 0.1]], [math.log(8)]),
+    "wind_tunnel": ([[22.5]], [-math.log(45)]),
+}
+
+
+@pytest.mark.parametrize("name", ANALYTIC)
+def test_the_density_of_the_prior_is_that_of_the_paper(name: str) -> None:
+    theta, expected = ANALYTIC[name]
+    log_prob = make(name).get_prior().log_prob(torch.tensor(theta))
+    assert log_prob.tolist() == pytest.approx(expected, rel=1e-5)
+
+
 @pytest.mark.medium
 @TASK
 def test_the_parts_of_a_task_are_new_each_time_and_making_them_draws_nothing(
@@ -208,33 +231,3 @@ def test_simulations_to_train_on_are_a_prefix_of_more_and_share_nothing_with_the
         observed, _ = getattr(task, f"get_{part}_set")(n, seed=1)
         assert same_rows(theta, observed) == 0
     assert same_rows(x, task.get_simulations(150, seed=2)[1]) == 0
-
-
-@pytest.mark.medium
-@TASK
-def test_sbi_simulates_and_builds_a_posterior_on_the_task(task: Task) -> None:
-    prior = process_prior(task.get_prior())[0]
-    theta, x = simulate_for_sbi(
-        task.get_simulator(), prior, 20, show_progress_bar=False
-    )
-    assert theta.shape == (20, task.theta_dim)
-    assert x.shape == (20, *task.x_shape)
-    theta, x = task.get_simulations(200)
-    build = posterior_nn(
-        "mdn", embedding_net=task.get_embedding_net(), z_score_x=task.z_score_x
-    )
-    posterior = DirectPosterior(build(theta, x), prior).set_default_x(x[:1])
-    assert torch.isfinite(
-        posterior.log_prob(
-            theta, leakage_correction_params={"num_rejection_samples": 100}
-        )
-    ).any()
-    assert within_support(
-        prior, posterior.sample((20,), show_progress_bars=False)
-    ).all()
-    mode = posterior.map(
-        num_iter=2, num_init_samples=20, num_to_optimize=2, show_progress_bars=False
-    )
-    assert within_support(prior, mode).all()
-    restored = pickle.loads(pickle.dumps(posterior))
-    assert within_support(restored.prior, theta).all()

@@ -1,11 +1,9 @@
 """The labelled sets of every task: reproducible, disjoint, of the law they should have.
 
-All sets are made by the same code: ``Task`` asks for a ``DrawnPairs`` or a
-``RecordedPairs`` and takes from it. The first test shows this, and which task overrides
-what; ``tests/unit/test_tasks_splits.py`` tests that code. The contract is then checked
-for the standard process of every task, and for the variants that run code of a task's
-own. One task with a process to draw from and one with recordings stand for the others
-in the variants that all tasks have.
+All sets are made by the same code, which ``tests/unit/test_tasks_splits.py`` tests. The
+contract is checked for the standard process of every task, and for the variants that
+run code of a task's own. One task with a process to draw from and one with recordings
+stand for the others in the variants that all tasks have.
 
 Sets are drawn once for all tests that read them (:func:`shared`); what must be
 reproduced is drawn anew and compared with them.
@@ -22,10 +20,8 @@ from sbi.utils import within_support
 from torch import Tensor
 
 from sbi_rope.tasks import TASKS, Task
-from sbi_rope.tasks.splits import DrawnPairs, RecordedPairs
 from sbi_rope.tasks.variants import COMMON_VARIANTS
 from tests.tasks import (
-    MEASURED,
     SUBTLE,
     as_many,
     draw,
@@ -37,18 +33,8 @@ from tests.tasks import (
 
 # Variants whose calibration set follows another law than the test set.
 ANOTHER_CALIBRATION_LAW = {"biased_calibration", "sensor_settings", "flipped"}
-# What tasks implement themselves of the code behind their sets.
-OVERRIDDEN = {
-    "_keep": {"light_tunnel"},
-    "_simulated_process": {"hemodynamics"},
-    "_well_specified_process": {"hemodynamics"},
-    "_take": set(),
-    "_process_of": set(),
-    "get_calibration_set": set(),
-    "get_test_set": set(),
-    "get_simulations": set(),
-    "num_recorded": set(),
-}
+# Variants that all tasks have, for which a task runs code of its own.
+OWN_CODE = {("light_tunnel", "biased_calibration"), ("hemodynamics", "well_specified")}
 # One process that is drawn and one that is recorded.
 FOR_THE_REST = {"pendulum", "light_tunnel_sensors"}
 # Tasks whose real process takes a tenth of a second for some hundred observations.
@@ -57,13 +43,8 @@ SLOW_PROCESS = {"cs", "light_tunnel", "sir"}
 
 def runs_code_of_its_own(name: str, variant: str | None) -> bool:
     """Whether no other task's tests run what this variant of this task runs."""
-    if variant not in COMMON_VARIANTS or name in FOR_THE_REST:
-        return True
-    methods = {
-        "biased_calibration": "_keep",
-        "well_specified": "_well_specified_process",
-    }
-    return name in OVERRIDDEN.get(methods.get(variant, ""), set())
+    is_common = variant in COMMON_VARIANTS and name not in FOR_THE_REST
+    return not is_common or (name, variant) in OWN_CODE
 
 
 def kinds(*more: str) -> pytest.MarkDecorator:
@@ -125,26 +106,6 @@ def state_of_all_generators() -> list[bytes]:
         repr(random.getstate()).encode(),
         repr(np.random.get_state()).encode(),  # noqa: NPY002
     ]
-
-
-def test_all_tasks_make_their_sets_with_the_code_of_the_base_class() -> None:
-    found = {
-        method: {
-            name
-            for name, task in TASKS.items()
-            if getattr(task, method) is not getattr(Task, method)
-        }
-        for method in OVERRIDDEN
-    }
-    assert found == OVERRIDDEN
-    for name, task in TASKS.items():
-        for variant in (None, *task.variants):
-            made = make(name, variant=variant)
-            if name in MEASURED and not made.has_data:
-                continue
-            assert made.has_data
-            kinds = {type(made._process_of(part)) for part in PARTS}
-            assert kinds <= {DrawnPairs, RecordedPairs}
 
 
 @pytest.mark.medium

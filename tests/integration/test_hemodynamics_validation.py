@@ -116,21 +116,6 @@ def test_small_waves_come_closer_to_the_linear_equations_with_finer_cells(
 # The solution itself -----------------------------------------------------------------
 
 
-@pytest.mark.medium
-def test_no_blood_is_lost() -> None:
-    for viscoelastic in (False, True):
-        physics = Physics(viscoelastic=viscoelastic)
-        network = build_network(BASELINE, physics)
-        flow = simulate_sites(network, BASELINE, physics, list(SITES.values()))
-        lost = flow.volume_in - flow.volume_out - flow.volume_change
-        assert abs(lost) < 1e-10 * flow.volume_in
-
-
-@pytest.mark.medium
-def test_as_much_blood_leaves_as_enters_once_beats_repeat() -> None:
-    assert simulate_beat(BASELINE, Physics(num_cycles=20)).mass_error < 1e-4
-
-
 @pytest.mark.slow
 def test_cells_of_another_length_and_shorter_steps_give_the_same_beat(
     beat: Beat,
@@ -184,13 +169,6 @@ def test_waves_travel_at_the_velocity_asked_for(viscoelastic: bool) -> None:
 
 
 @pytest.mark.medium
-def test_the_mean_pressure_is_near_its_target(beat: Beat) -> None:
-    for target in (75.0, 110.0):
-        wave = simulate_beat(replace(BASELINE, mean_pressure=target)).pressure["aortic"]
-        assert wave.mean() == pytest.approx(target, abs=3.0)
-
-
-@pytest.mark.medium
 def test_the_pressures_of_a_man_of_25_are_those_published(beat: Beat) -> None:
     for site, systolic, diastolic in (
         ("aortic", 102, 76),
@@ -200,18 +178,6 @@ def test_the_pressures_of_a_man_of_25_are_those_published(beat: Beat) -> None:
         wave = beat.pressure[site]
         assert wave.max() == pytest.approx(systolic, abs=5.0)
         assert wave.min() == pytest.approx(diastolic, abs=4.0)
-
-
-def test_the_pulse_grows_on_its_way_to_the_wrist(beat: Beat) -> None:
-    pulse = {site: np.ptp(wave) for site, wave in beat.pressure.items()}
-    assert pulse["aortic"] < pulse["brachial"] < pulse["radial"]
-    assert 1.5 < pulse["radial"] / pulse["aortic"] < 1.9
-
-
-@pytest.mark.medium
-def test_stiffer_arteries_have_a_larger_pulse(beat: Beat) -> None:
-    stiff = simulate_beat(replace(BASELINE, pulse_wave_velocity=10.0))
-    assert np.ptp(stiff.pressure["aortic"]) > 1.3 * np.ptp(beat.pressure["aortic"])
 
 
 @pytest.mark.slow

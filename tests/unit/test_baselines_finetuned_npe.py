@@ -95,6 +95,19 @@ def test_with_one_holdout_it_is_one_network_tuned_on_the_rest() -> None:
     assert torch.allclose(again, expected, atol=1e-4)
 
 
+def test_of_several_learning_rates_and_the_start_the_best_is_kept() -> None:
+    kept = {}
+    for rates in [(1e-6,), (1e-2,), (1e-6, 1e-2), (1e-2, 1e-6)]:
+        history = finetuned(npe(), learning_rates=rates).history
+        kept[rates] = history.kept_validation_loss
+        if 1e-2 in rates:
+            assert history.learning_rate == 1e-2
+    assert kept[1e-2,] < kept[1e-6,]
+    method = finetuned(npe(), learning_rates=(100.0,))
+    assert method.history.best_epoch == 0
+    assert torch.equal(log_probs(method.build_posterior()), log_probs(npe()))
+
+
 @pytest.mark.medium
 def test_every_pair_is_held_out_by_one_network() -> None:
     for count in [2, 5, 20]:

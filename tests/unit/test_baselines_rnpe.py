@@ -8,53 +8,43 @@ import pytest
 import torch
 from torch.distributions import Normal
 
-from sbi_rope.baselines.error_model import SpikeAndSlab
-from sbi_rope.baselines.rnpe import RNPE, Denoised
-from sbi_rope.baselines.statistics import fit_marginal
+from sbi_rope.baselines import RNPE, SpikeAndSlab, Training
+from sbi_rope.baselines.rnpe import fit_marginal
 from sbi_rope.errors import RoPEWarning
 from sbi_rope.metrics import lpp
-from sbi_rope.trainers.training import Training
 from tests import gaussian
 
 # theta ~ N(0, 1), x = theta + 0.5 eps, q(theta | s) = N(s, 0.2) with s = 0.8 x.
 STATISTIC_STD = gaussian.GAIN * (1 + gaussian.NOISE_STD**2) ** 0.5
 X_O = torch.tensor([[0.0], [1.0], [3.5], [40.0]])
+ONCE = Training(max_num_epochs=1)
+QUIET: dict[str, Any] = {"seed": 0, "show_progress_bars": False}
 
 
 @functools.cache
 def one_statistic(noise_on: str = "embedding") -> Any:
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        theta = gaussian.prior(1).sample(torch.Size((3000,)))
-        method = RNPE.from_posterior(
-            gaussian.posterior(1),
-            noise_on=noise_on,
-            num_denoised=800,
-            num_chains=20,
-            warmup=20,
-            thin=1,
-            training=Training(learning_rate=5e-3, max_num_epochs=25),
-        )
-        method.append_simulations(theta, gaussian.simulator(theta))
-        return method.train(seed=0, show_progress_bars=False)
-
-
-def quick(posterior: Any = None, **options: Any) -> RNPE:
-    """Two statistics, few draws."""
-    fast = Training(max_num_epochs=1)
-    options = {"num_denoised": 20, "warmup": 5, "thin": 1, "training": fast, **options}
-    npe = gaussian.posterior() if posterior is None else posterior
-    theta = gaussian.prior().sample(torch.Size((200,)))
-    method = RNPE.from_posterior(npe, **options)
-    return method.append_simulations(theta, gaussian.simulator(theta))
+    torch.manual_seed(0)
+    theta = gaussian.prior(1).sample(torch.Size((3000,)))
+    method = RNPE.from_posterior(
+        gaussian.posterior(1),
+        noise_on=noise_on,
+        num_denoised=800,
+        num_chains=20,
+        warmup=20,
+        thin=1,
+        training=Training(learning_rate=5e-3, max_num_epochs=25),
+    )
+    method.append_simulations(theta, gaussian.simulator(theta))
+    return method.train(**QUIET).build_posterior()
 
 
 def quick_posterior(**options: Any) -> Any:
-    return quick(**options).train(seed=0, show_progress_bars=False).build_posterior()
-
-
-def mixing_of(posterior: Any) -> Denoised:
-    return posterior.posterior_estimator
+    """Two statistics, few draws."""
+    options = {"num_denoised": 20, "warmup": 5, "thin": 1, "training": ONCE} | options
+    theta = gaussian.prior().sample(torch.Size((200,)))
+    method = RNPE.from_posterior(gaussian.posterior(), **options)
+    method.append_simulations(theta, gaussian.simulator(theta))
+    return method.train(**QUIET).build_posterior()
 
 
 def closed_form(x: float) -> tuple[float, float]:
@@ -84,7 +74,7 @@ def test_one_gaussian_statistic_gives_the_posterior_found_by_quadrature(
     noise_on: str,
 ) -> None:
     # Of one statistic, input and embedding are the same in standard deviations.
-    posterior = one_statistic(noise_on).build_posterior()
+    posterior = one_statistic(noise_on)
     theta = posterior.sample_batched((3000,), x=X_O, show_progress_bars=False)
     for x, draws in zip(X_O[:, 0], theta[..., 0].T, strict=True):
         mean, std = closed_form(float(x))
@@ -97,34 +87,11 @@ def test_log_prob_is_the_mean_density_over_the_denoised_statistics() -> None:
     posterior = quick_posterior()
     x, theta = torch.randn(3, 2), torch.randn(4, 3, 2)
     values = posterior.log_prob_batched(theta, x=x, norm_posterior=False)
-    s = mixing_of(posterior).embed(x)
-    for sample in range(4):
-        for row in range(3):
-            terms = [
-                float(
-                    Normal(one, gaussian.POSTERIOR_STD)
-                    .log_prob(theta[sample, row])
-                    .sum()
-                    .exp()
-                )
-                for one in s[row]
-            ]
-            expected = math.log(sum(terms) / len(terms))
-            assert float(values[sample, row]) == pytest.approx(expected, abs=1e-4)
-
-
-@pytest.mark.slow
-def test_samples_follow_the_density() -> None:
-    posterior = one_statistic().build_posterior()
-    x = X_O[2:3]
-    theta = posterior.sample((4000,), x=x, show_progress_bars=False)[:, 0]
-    grid = torch.linspace(-6, 6, 2001)
-    density = posterior.log_prob(grid[:, None], x=x, norm_posterior=False).exp()
-    assert float(torch.trapezoid(density, grid)) == pytest.approx(1.0, abs=1e-3)
-    cumulative = torch.cumulative_trapezoid(density, grid)
-    for point in (500, 900, 1100, 1300, 1500):
-        share = float((theta < grid[point]).float().mean())
-        assert share == pytest.approx(float(cumulative[point - 1]), abs=0.03)
+    s = posterior.posterior_estimator.embed(x)
+    law = Normal(s, gaussian.POSTERIOR_STD)
+    log_q = law.log_prob(theta[:, :, None]).sum(dim=-1)
+    expected = log_q.logsumexp(dim=-1) - math.log(s.shape[1])
+    assert torch.allclose(values, expected, atol=1e-4)
 
 
 @pytest.mark.medium
@@ -135,27 +102,19 @@ def test_with_one_wrong_statistic_it_is_far_better_than_npe() -> None:
     )
     theta = gaussian.prior().sample(torch.Size((30,)))
     x = gaussian.simulator(theta) + torch.tensor([0.0, 20.0])
-    exact = gaussian.posterior()
-    assert lpp(posterior, theta, x).mean > lpp(exact, theta, x).mean + 50.0
-    assert lpp(posterior, theta, x).mean > gaussian.prior().log_prob(theta).mean()
+    found = lpp(posterior, theta, x).mean
+    assert found > lpp(gaussian.posterior(), theta, x).mean + 50.0
+    assert found > gaussian.prior().log_prob(theta).mean()
 
 
 @pytest.mark.medium
 def test_the_marginal_density_is_that_of_the_statistics() -> None:
-    s = torch.randn(2000, 2)
-    s[:, 1] = 0.8 * s[:, 0] + 0.6 * s[:, 1]
-    flow, history = fit_marginal(
-        s,
-        jitter=0.01,
-        training=Training(learning_rate=5e-3, max_num_epochs=25),
-        show_progress_bars=False,
-    )
+    mixing = torch.tensor([[1.0, 0.8], [0.0, 0.6]])
+    s, fresh = torch.randn(2000, 2) @ mixing, torch.randn(2000, 2) @ mixing
+    training = Training(learning_rate=5e-3, max_num_epochs=25)
+    flow, _ = fit_marginal(s, jitter=0.01, training=training, show_progress_bars=False)
     entropy = math.log(2 * math.pi * math.e) + math.log(0.6)
-    fresh = torch.randn(2000, 2)
-    fresh[:, 1] = 0.8 * fresh[:, 0] + 0.6 * fresh[:, 1]
-    with torch.no_grad():
-        assert float(flow.loss(fresh).mean()) == pytest.approx(entropy, abs=0.12)
-    assert history.kept_validation_loss == pytest.approx(entropy, abs=0.3)
+    assert float(flow.loss(fresh).mean()) == pytest.approx(entropy, abs=0.12)
 
 
 def test_the_marginal_density_starts_as_a_standard_normal_one() -> None:
@@ -165,50 +124,28 @@ def test_the_marginal_density_starts_as_a_standard_normal_one() -> None:
         flow, _ = fit_marginal(s, jitter=0.01, training=still, show_progress_bars=False)
         far = 3.0 * torch.randn(100, dim)
         expected = Normal(0.0, 1.0).log_prob(far).sum(dim=-1)
-        with torch.no_grad():
-            assert torch.allclose(-flow.loss(far), expected, atol=0.3)
+        assert torch.allclose(-flow.loss(far), expected, atol=0.3)
 
 
 # --- the posterior as an object ---
 
 
 @pytest.mark.medium
-def test_what_was_denoised_is_kept() -> None:
-    posterior = quick_posterior()
-    mixing, x = mixing_of(posterior), torch.randn(3, 2)
-    first = mixing.embed(x)
-    # In other company and order, and as -0 for 0.
-    assert torch.equal(mixing.embed(x[[2, 0]]), first[[2, 0]])
-    mixed = torch.cat([torch.randn(2, 2), x[1:2]])
-    assert torch.equal(mixing.embed(mixed)[2], first[1])
-    zero = mixing.embed(torch.zeros(1, 2))
-    num_kept = len(mixing._denoised)
-    assert torch.equal(mixing.embed(-torch.zeros(1, 2)), zero)
-    assert len(mixing._denoised) == num_kept
-
-
-def test_denoising_leaves_the_random_numbers_of_the_caller_alone() -> None:
-    posterior, x = quick_posterior(), torch.randn(1, 2)
+def test_what_was_denoised_is_kept_and_leaves_the_random_state_alone() -> None:
+    denoised, x = quick_posterior().posterior_estimator, torch.randn(3, 2)
     state = torch.get_rng_state()
-    mixing_of(posterior).embed(x)
+    first = denoised.embed(x)
     assert torch.equal(torch.get_rng_state(), state)
-
-
-# --- convergence and wrong use ---
+    # In other company and order.
+    assert torch.equal(denoised.embed(x[[2, 0]]), first[[2, 0]])
+    mixed = torch.cat([torch.randn(2, 2), x[1:2]])
+    assert torch.equal(denoised.embed(mixed)[2], first[1])
 
 
 def test_chains_that_disagree_are_warned_of_and_measured() -> None:
-    posterior = quick_posterior(num_denoised=16, warmup=1)
+    denoised = quick_posterior(num_denoised=16, warmup=1).posterior_estimator
     # Where spike and slab compete, a few draws do not tell their shares.
     x = torch.linspace(3.3, 4.2, 10)[:, None] * torch.tensor([1.0, -1.0])
     with pytest.warns(RoPEWarning, match="R-hat"):
-        mixing_of(posterior).embed(x)
-    assert (mixing_of(posterior).r_hat(x) > 1.1).any()
-
-
-@pytest.mark.medium
-def test_far_observations_are_treated_as_at_the_bound() -> None:
-    mixing = mixing_of(quick_posterior())
-    far, farther = (mixing.embed(torch.tensor([[value, 0.0]])) for value in (1e8, 1e9))
-    assert torch.isfinite(far).all()
-    assert torch.equal(far, farther)
+        denoised.embed(x)
+    assert (denoised.r_hat(x) > 1.1).any()

@@ -1,7 +1,6 @@
 """Stored beats: made in parallel, and read."""
 
 import importlib
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from sbi_rope.errors import DataNotFoundError, InvalidInputError, SimulationError
+from sbi_rope.errors import InvalidInputError, SimulationError
 from sbi_rope.tasks.hemodynamics import generation
+from sbi_rope.tasks.hemodynamics.__main__ import main
 from sbi_rope.tasks.hemodynamics.dataset import BeatSet, load
 from sbi_rope.tasks.hemodynamics.generation import generate
 from sbi_rope.tasks.hemodynamics.population import NUISANCES, Population
@@ -36,10 +36,10 @@ def hum(subject: Subject, physics: Physics) -> Beat:
     )
 
 
-def _make(path: Path, simulate: Any = hum, **changes: Any) -> BeatSet:
+def _make(path: Path, **changes: Any) -> BeatSet:
     settings: dict[str, Any] = {"n": N, "process": "real", "seed": 4, "jobs": 1}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(generation, "simulate_beat", simulate)
+        patch.setattr(generation, "simulate_beat", hum)
         return generate(path, **(settings | {"progress": False} | changes))
 
 
@@ -47,14 +47,6 @@ def _make(path: Path, simulate: Any = hum, **changes: Any) -> BeatSet:
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("beats") / "real.npz"
     _make(path)
-    return path
-
-
-@pytest.fixture
-def file(made: Path, tmp_path: Path) -> Path:
-    """Return a copy that may be damaged."""
-    path = tmp_path / "copy.npz"
-    path.write_bytes(made.read_bytes())
     return path
 
 
@@ -93,23 +85,6 @@ def test_people_who_cannot_be_simulated_are_counted_and_replaced_by_the_next(
     assert len(ages) > N
 
 
-def test_settings_are_stored(made: Path) -> None:
-    settings = load(made).settings
-    assert settings["process"] == "real"
-    assert (settings["n"], settings["seed"]) == (N, 4)
-    assert settings["population"] == asdict(Population())
-    assert settings["physics"] == asdict(Physics())
-
-
-def test_files_of_the_simulator_hold_no_lengths_of_arteries(tmp_path: Path) -> None:
-    narrow = _make(tmp_path / "a.npz", n=3, process="simulator")
-    assert narrow.length_factors is None
-    wide = Population(segment_sd=0.4)
-    _make(tmp_path / "b.npz", n=3, process="simulator", population=wide)
-    same = (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
-    assert same  # lengths vary in the real process only
-
-
 def test_a_file_has_the_same_bytes_for_any_number_of_jobs(
     made: Path, tmp_path: Path
 ) -> None:
@@ -119,37 +94,29 @@ def test_a_file_has_the_same_bytes_for_any_number_of_jobs(
     assert [path.name for path in tmp_path.iterdir()] == ["again.npz"]
 
 
-# Bad input ---------------------------------------------------------------------------
-
-
-def test_a_finished_file_is_never_overwritten(file: Path) -> None:
-    content = file.read_bytes()
+def test_a_finished_file_is_never_overwritten(made: Path) -> None:
+    content = made.read_bytes()
     with pytest.raises(InvalidInputError, match="Expected no file"):
-        _make(file)
-    assert file.read_bytes() == content
+        _make(made)
+    assert made.read_bytes() == content
 
 
-def test_generating_stops_where_nobody_can_be_simulated(tmp_path: Path) -> None:
-    def fail(subject: Subject, physics: Physics) -> Beat:
-        raise SimulationError("The flow stopped at 3.5 s; 2 mmHg left.")
-
-    with pytest.raises(SimulationError, match="The flow stopped at # s"):
-        _make(tmp_path / "again.npz", simulate=fail, n=30)
-
-
-def test_files_that_are_no_data_set_are_refused(file: Path) -> None:
-    with pytest.raises(DataNotFoundError, match=r"none\.npz.*generate"):
-        load(file.with_name("none.npz"))
-    with pytest.raises(InvalidInputError, match="of simulator"):
-        load(file, process="simulator")
-    content = file.read_bytes()
-    for damaged in (content[: len(content) // 2], b"", b"a,b\n1,2\n"):
-        file.write_bytes(damaged)
-        with pytest.raises(InvalidInputError, match=r"copy\.npz"):
-            load(file)
-    np.savez(file, x=np.ones(3))
-    with pytest.raises(InvalidInputError, match="settings"):
-        load(file)
+def test_the_command_writes_the_file_and_counts_the_rejected(
+    tmp_path: Path,
+    terminal: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(generation, "simulate_beat", hum)
+    out = tmp_path / "x.npz"
+    options = f"generate --n 50 --process real --seed 3 --out {out}"
+    assert main(options.split()) == 0
+    captured = terminal.readouterr()
+    beats = load(out, process="real")
+    assert (len(beats), beats.settings["seed"]) == (50, 3)
+    rejected = sum(beats.rejected.values())
+    assert f"50 people, {rejected} rejected" in captured.out
+    assert f"{rejected}: The flow broke down after # years" in captured.out
+    assert "50/50" in captured.err  # of the progress bar
 
 
 @pytest.mark.medium

@@ -45,16 +45,6 @@ def test_flow_peaks_turns_and_ends_when_it_should() -> None:
         assert (flow[time >= end] == 0).all()
 
 
-def test_reverse_flow_is_shortened_to_fit_the_beat() -> None:
-    subject = replace(BASELINE, heart_rate=120.0, ejection_time=480.0)
-    flow = aortic_inflow(subject, 8000)
-    assert flow.mean() * subject.period == pytest.approx(
-        BASELINE.stroke_volume, rel=1e-5
-    )
-    assert (flow[: int(0.96 * 8000)] >= 0).all()
-    assert (flow[int(0.961 * 8000) :] < 0).all()
-
-
 def test_the_table_reproduces_the_published_waveform() -> None:
     path = TEST_DATA / "hemodynamics" / "inflow_template_mynard2015.csv"
     time, published = np.loadtxt(path, delimiter=",", skiprows=2, unpack=True)

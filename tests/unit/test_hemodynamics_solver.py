@@ -1,7 +1,5 @@
 """The solver of blood flow, on small networks, and the beats made with it."""
 
-import sys
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -9,11 +7,9 @@ import numpy as np
 import pytest
 
 from sbi_rope.errors import SimulationError
-from sbi_rope.tasks import hemodynamics
 from sbi_rope.tasks.hemodynamics import waveforms
 from sbi_rope.tasks.hemodynamics.network import Network
 from sbi_rope.tasks.hemodynamics.solver import Flow, solve
-from sbi_rope.tasks.hemodynamics.subject import Physics
 from tests.blood_flow import BASELINE, REST, linear_pressure, make_network
 
 pytest.importorskip("numba")
@@ -132,28 +128,6 @@ def test_it_does_not_matter_which_end_of_a_segment_is_its_inlet(
     np.testing.assert_allclose(first.pressure, second.pressure, rtol=1e-9)
 
 
-@pytest.mark.parametrize("viscosity", [0.0, 0.6])
-def test_a_joint_within_a_tube_changes_nothing(viscosity: float) -> None:
-    whole = make_network(
-        [(0, 1)],
-        length=[0.4],
-        radius=[(0.01, 0.006)],
-        outlets=[0],
-        viscosity=viscosity,
-    )
-    halves = make_network(
-        [(0, 1), (1, 2)],
-        length=[0.2, 0.2],
-        radius=[(0.01, 0.008), (0.008, 0.006)],
-        outlets=[1],
-        viscosity=viscosity,
-    )
-    first = run(whole, 1e-4 * HALF_SINE, sites=[(0, 0.4), (0, 0.75)])
-    second = run(halves, 1e-4 * HALF_SINE, sites=[(0, 0.8), (1, 0.5)])
-    error = np.abs(first.pressure - second.pressure).max()
-    assert error < 5e-5 * np.ptp(first.pressure)
-
-
 # Waves -------------------------------------------------------------------------------
 
 
@@ -229,65 +203,7 @@ def test_a_flow_that_is_too_strong_is_reported() -> None:
         run(loop(), 1.0 * HALF_SINE)
 
 
-def test_without_numba_the_message_names_the_extra_to_install(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setitem(sys.modules, "numba", None)
-    monkeypatch.delitem(
-        sys.modules, "sbi_rope.tasks.hemodynamics.kernels", raising=False
-    )
-    monkeypatch.delattr(hemodynamics, "kernels", raising=False)
-    with pytest.raises(ImportError, match=r"sbi-rope\[hemodynamics\]"):
-        run(loop(), HALF_SINE)
-
-
 # Beats -------------------------------------------------------------------------------
-
-
-def failing_first(
-    error: bool,
-) -> Callable[..., Flow]:
-    """Return a simulation that fails, or does not repeat, with the first number."""
-    simulate = waveforms.simulate_sites
-
-    def simulate_sites(*arguments: Any, courant: float, **options: Any) -> Flow:
-        flow = simulate(*arguments, courant=courant, **options)
-        if courant < 0.6:
-            return flow
-        if error:
-            raise SimulationError("not finite")
-        return replace(flow, previous=flow.previous + 1e3)
-
-    return simulate_sites
-
-
-@pytest.mark.medium
-def test_a_failed_run_is_tried_again_with_smaller_steps(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    for error in (True, False):
-        with monkeypatch.context() as patch:
-            patch.setattr(waveforms, "simulate_sites", failing_first(error))
-            beat = waveforms.simulate_beat(BASELINE, Physics(cell_length=0.02))
-        assert beat.courant == 0.4
-
-
-def test_beats_that_do_not_repeat_are_an_error() -> None:
-    physics = Physics(cell_length=0.02, num_cycles=2, max_period_error=1e-3)
-    with pytest.raises(SimulationError, match="`num_cycles`"):
-        waveforms.simulate_beat(BASELINE, physics)
-
-
-@pytest.mark.medium
-def test_a_beat_has_its_pressures_at_256_phases_in_mmhg_the_same_each_time() -> None:
-    physics = Physics(cell_length=0.02)
-    beat, again = (waveforms.simulate_beat(BASELINE, physics) for _ in range(2))
-    assert set(beat.pressure) == {"radial", "brachial", "aortic"}
-    for site, wave in beat.pressure.items():
-        assert wave.shape == (256,)
-        assert 60 < wave.min() < wave.max() < 140
-        np.testing.assert_array_equal(wave, again.pressure[site])
-    assert beat.period == BASELINE.period
 
 
 @pytest.mark.medium

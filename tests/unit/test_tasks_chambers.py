@@ -45,14 +45,6 @@ def random_image(size: int = 16) -> Tensor:
 # Files and tables --------------------------------------------------------------------
 
 
-def test_columns_come_in_the_order_asked_for(tmp_path: Path) -> None:
-    (tmp_path / "t.csv").write_text("a,b,c\n1,2,x\n3,4,y\n")
-    values = read_columns(tmp_path / "t.csv", ["b", "a"])
-    assert torch.equal(
-        values, torch.tensor([[2.0, 1.0], [4.0, 3.0]], dtype=torch.float64)
-    )
-
-
 def test_missing_files_columns_and_numbers_are_named(tmp_path: Path) -> None:
     for root in (None, tmp_path):
         with pytest.raises(DataNotFoundError, match=rf"{FILE}.*download=True"):
@@ -82,11 +74,6 @@ def test_images_are_read_channels_first_in_the_order_asked_for(tmp_path: Path) -
     assert read_images(tmp_path, [], 16).shape == (0, 3, 16, 16)
 
 
-def test_missing_images_are_named(tmp_path: Path) -> None:
-    with pytest.raises(DataNotFoundError, match=r"7\.png"):
-        read_images(tmp_path, ["7.png"], 16)
-
-
 # Downloads ---------------------------------------------------------------------------
 
 
@@ -100,12 +87,6 @@ def test_the_extract_is_the_beginning_of_the_published_files(
         assert published.startswith(extract.read_bytes())
 
 
-def test_rows_that_end_with_a_comma_are_not_shifted(tmp_path: Path) -> None:
-    path = tmp_path / "table.csv"
-    path.write_text("a,b\n1,2,\n3,4,\n")
-    assert read_columns(path, ["a", "b"]).tolist() == [[1.0, 2.0], [3.0, 4.0]]
-
-
 def test_a_download_puts_the_whole_data_set_in_its_place(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -115,22 +96,6 @@ def test_a_download_puts_the_whole_data_set_in_its_place(
     assert find_file(FILE, root=root, download=True).read_text() == "a,b\n1,2\n"
     assert calls == [DATASET]
     assert [path.name for path in root.iterdir()] == [DATASET]
-
-
-def test_a_download_cut_off_half_way_leaves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def break_off(folder: Path) -> None:
-        unpack(folder)
-        raise KeyboardInterrupt
-
-    stub_downloads(monkeypatch, break_off)
-    with pytest.raises(KeyboardInterrupt):
-        find_file(FILE, root=tmp_path, download=True)
-    assert list(tmp_path.iterdir()) == []
-    # The next attempt starts anew.
-    stub_downloads(monkeypatch, unpack)
-    assert find_file(FILE, root=tmp_path, download=True).is_file()
 
 
 def stub_downloads(monkeypatch: pytest.MonkeyPatch, action: Unpack) -> list[str]:

@@ -1,7 +1,6 @@
 """Cancer and stromal cells."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -74,43 +73,6 @@ def test_statistics_are_those_of_a_naive_implementation() -> None:
             assert list(x) == pytest.approx(expected, rel=1e-12)
 
 
-def test_a_parent_owns_one_cell_more_than_its_daughters() -> None:
-    rng = np.random.default_rng(0)
-    x = tissue_statistics(
-        cells=rng.random((2, 100)),
-        parents=rng.random((2, 1)),
-        num_daughters=np.array([7]),
-        necrotic=np.array([False]),
-        necrosis_radius=0.8,
-    )
-    assert x[:2] == (92, 8)
-
-
-def test_a_cell_on_the_edge_of_the_necrosis_is_alive() -> None:
-    # Distances 0.25, 0.5, 0.5 and 1 from the parent, whose disc has radius 0.5.
-    tissue = {
-        "cells": np.array([[0.25, 0.5, 0.0, 1.0], [0.0, 0.0, 0.5, 0.0]]),
-        "parents": np.zeros((2, 1)),
-        "num_daughters": np.array([1]),
-        "necrotic": np.array([True]),
-    }
-    for radius, num_cancer in ((0.5, 3), (0.75, 2), (1.0, 2)):
-        expected = (1, num_cancer, 0.5, 0.5)
-        assert tissue_statistics(**tissue, necrosis_radius=radius) == expected
-
-
-def test_a_tissue_without_a_stromal_cell_has_no_statistics() -> None:
-    # Without a cell, with too few for the parent, without and with a stromal one.
-    for num_cells, defined in ((0, False), (7, False), (8, False), (9, True)):
-        tissue = random_tissue(0, num_cells=num_cells) | {
-            "parents": np.full((2, 1), 0.5),
-            "num_daughters": np.array([7]),
-            "necrotic": np.array([False]),
-        }
-        x = np.array(tissue_statistics(**tissue, necrosis_radius=0.8))
-        assert np.isfinite(x).tolist() == [defined] * 4
-
-
 def test_a_tissue_without_a_cancer_cell_has_no_statistics() -> None:
     # Each of the two cancer cells is inside of the necrosis of one parent.
     tissue = {
@@ -162,14 +124,6 @@ def test_necrosis_takes_half_of_the_cancer_cells_and_no_stromal_cell() -> None:
     assert (real[:, 2:] >= simulated[:, 2:]).all()
 
 
-def test_without_necrosis_the_simulator_is_exact() -> None:
-    theta = CancerStroma().get_prior().sample((50,))
-    simulated = seeded(CancerStromaSimulator(), theta)
-    for without in ({"necrosis_probability": 0.0}, {"necrosis_radius": 0.0}):
-        assert torch.equal(seeded(replace(NECROSIS, **without), theta), simulated)
-    assert not torch.equal(seeded(NECROSIS, theta), simulated)
-
-
 def test_statistics_that_are_not_defined_are_nan() -> None:
     theta = torch.tensor([[0.0, 5.0, 15.0], [3.0, 5.0, 15.0], [1000.0, 5.0, 15.0]])
     x = CancerStromaSimulator()(theta)
@@ -178,30 +132,6 @@ def test_statistics_that_are_not_defined_are_nan() -> None:
 
 
 # The task ----------------------------------------------------------------------------
-
-
-def test_density_and_quantiles_of_the_prior_are_analytic() -> None:
-    theta, _ = CancerStroma().get_test_set(20)
-    log_prob = CancerStroma().get_prior().log_prob(theta)
-    torch.testing.assert_close(log_prob, torch.full((20,), -math.log(1300 * 17 * 10)))
-    theta = torch.tensor([[200.0, 20.0, 12.5], [850.0, 11.5, 20.0]])
-    expected = torch.tensor([[0.0, 1.0, 0.25], [0.5, 0.5, 1.0]])
-    torch.testing.assert_close(CancerStroma().prior_quantiles(theta), expected)
-
-
-def test_options_reach_the_real_process_only() -> None:
-    strong = CancerStroma(necrosis_probability=1.0, necrosis_radius=1.0)
-    _, x = strong.get_test_set(200)
-    _, default = CancerStroma().get_test_set(200)
-    assert x[:, 1].mean() < 0.5 * default[:, 1].mean()
-    assert strong.get_simulator() == CancerStroma().get_simulator()
-
-
-def test_network_has_the_widths_of_the_paper() -> None:
-    for light in (False, True):
-        net = CancerStroma().get_embedding_net(light=light)
-        widths = [layer.out_features for layer in net if hasattr(layer, "out_features")]
-        assert widths == [12, 48, 48, 36, 9]
 
 
 def seeded(simulator: CancerStromaSimulator, theta: Tensor) -> Tensor:

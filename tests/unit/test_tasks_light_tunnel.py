@@ -6,10 +6,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor, nn
-from torch.distributions import Beta
+from torch import Tensor
 
-from sbi_rope.errors import DataNotFoundError
 from sbi_rope.tasks.light_tunnel import (
     BETA_BINOMIAL,
     DATASET,
@@ -24,7 +22,6 @@ from sbi_rope.tasks.light_tunnel_models import (
     hexagon_mask,
     malus,
 )
-from sbi_rope.tasks.networks import ImageEmbedding
 from tests.tasks import all_recorded
 
 SIZE = 64
@@ -183,21 +180,6 @@ def test_camera_adds_noise_before_it_rounds_to_8_bit() -> None:
 # The prior and the protocols ---------------------------------------------------------
 
 
-def test_prior_log_density_is_analytic() -> None:
-    theta = torch.tensor([[0.0, 254.0, 100.0, 0.5], [1.0, 2.0, 3.0, 0.1]])
-    alpha = theta[:, 3]
-    expected = -3 * math.log(255) - (math.pi * (alpha * (1 - alpha)).sqrt()).log()
-    torch.testing.assert_close(LightTunnel().get_prior().log_prob(theta), expected)
-
-
-def test_quantiles_of_recorded_parameters_are_uniform() -> None:
-    inputs = draw_inputs(20_000)
-    theta = torch.cat([inputs[:, :3], malus(inputs[:, 3:])], dim=1).float()
-    levels = LightTunnel().prior_quantiles(theta).sort(dim=0).values
-    distance = levels - torch.linspace(0, 1, 20_000).unsqueeze(1)
-    assert distance.abs().max() < 0.015
-
-
 def test_crowded_parameters_are_beta_binomial() -> None:
     stats = pytest.importorskip("scipy.stats")
     theta = draw_crowded(20_000)
@@ -220,59 +202,6 @@ def test_crowded_parameters_are_beta_binomial() -> None:
     assert theta.dtype == torch.float32
 
 
-# The networks ------------------------------------------------------------------------
-
-
-def test_the_number_of_features_follows_the_size_of_the_image() -> None:
-    for size, num_features in ((64, 12), (87, 27), (100, 27)):
-        net = ImageEmbedding(image_size=size)
-        assert net.num_features == num_features
-        assert net(torch.rand(2, 3, size, size)).shape == (2, 20)
-
-
-def test_layers_of_the_network_are_those_of_the_paper() -> None:
-    net = ImageEmbedding()
-    convolutions = [
-        (m.in_channels, m.out_channels, m.kernel_size[0], m.stride[0], m.dilation[0])
-        for m in net.modules()
-        if isinstance(m, nn.Conv2d)
-    ]
-    assert convolutions == [
-        (3, 64, 3, 2, 1),
-        (64, 128, 3, 2, 1),
-        (128, 128, 3, 2, 1),
-        (128, 64, 1, 1, 1),
-        (64, 3, 1, 1, 1),
-    ]
-    linear = [
-        (m.in_features, m.out_features)
-        for m in net.modules()
-        if isinstance(m, nn.Linear)
-    ]
-    assert linear == [(27, 100), (100, 20)]
-
-
-@pytest.mark.medium
-def test_no_channel_of_an_untrained_network_is_dead() -> None:
-    task = LightTunnel(image_size=SIZE)
-    x = task.get_simulator()(task.get_prior().sample((20,)))
-    for _ in range(30):
-        features = task.get_embedding_net().features(x).reshape(20, 3, -1)
-        assert (features.std(dim=0) > 0).any(dim=1).all()
-
-
-def test_the_light_network_starts_from_means_over_squares() -> None:
-    net = ImageEmbedding(light=True)
-    means = net.features(HexagonSimulator()(torch.tensor([[255.0, 0.0, 51.0, 1.0]])))
-    red, green, blue = means.reshape(3, 10, 10)
-    expected = hexagon_mask(100).reshape(10, 10, 10, 10).mean(dim=(1, 3)).float()
-    torch.testing.assert_close(red, expected)
-    torch.testing.assert_close(blue, 0.2 * expected)
-    assert not green.any()
-    parameters = [sum(p.numel() for p in n.parameters()) for n in (net.head, net)]
-    assert parameters[0] == parameters[1]
-
-
 # Recorded images ---------------------------------------------------------------------
 
 
@@ -287,44 +216,6 @@ def test_rows_of_a_file_become_parameters_and_images(write_data: WriteData) -> N
     assert x.dtype == torch.float32
     for row, image in zip(i.tolist(), x, strict=True):
         assert torch.equal(image, pixels_of(int(row)) / 255)
-
-
-def test_only_images_of_chosen_rows_are_read(write_data: WriteData) -> None:
-    root = write_data()
-    task = LightTunnel(root=root, image_size=SIZE)
-    chosen = task.get_test_set(3)[0][:, 0].int().tolist()
-    for i in set(range(12)) - set(chosen):
-        (root / DATASET / UNIFORM / f"images_{SIZE}" / f"img_{i}.png").unlink()
-    assert task.get_test_set(3)[0][:, 0].int().tolist() == chosen
-    with pytest.raises(DataNotFoundError, match="img_"):
-        task.get_test_set(4)
-
-
-def test_dequantised_images_get_the_same_noise_whenever_they_are_read(
-    write_data: WriteData,
-) -> None:
-    root = write_data()
-    task = LightTunnel(root=root, image_size=SIZE, dequantise=True)
-    theta, x = task.get_test_set(6)
-    plain = LightTunnel(root=root, image_size=SIZE).get_test_set(6)[1]
-    noise = 256 * x - 255 * plain
-    assert noise.min() >= -1e-3
-    assert noise.max() <= 1.001
-    assert noise.mean() == pytest.approx(0.5, abs=0.01)
-    assert (noise[0] - noise[1]).abs().mean() > 0.3
-    other = task.get_test_set(6, seed=1)
-    row = int((other[0][:, 0] == theta[0, 0]).nonzero()[0])
-    assert torch.equal(other[1][row], x[0])
-
-
-def test_the_flipped_variant_turns_test_images_only(write_data: WriteData) -> None:
-    root = write_data()
-    task = LightTunnel(root=root, image_size=SIZE, variant="flipped")
-    for part, flipped in (("calibration", False), ("test", True)):
-        theta, x = getattr(task, f"get_{part}_set")(4)
-        for row, image in zip(theta[:, 0].tolist(), x, strict=True):
-            expected = pixels_of(int(row)) / 255
-            assert torch.equal(image, expected.flip(1) if flipped else expected)
 
 
 @pytest.mark.parametrize(
@@ -354,35 +245,3 @@ def test_each_variant_takes_its_sets_from_its_experiments(
         # All rows of the part are there: nothing is rejected.
         theta, _ = draw(num_rows[experiment])
         assert ((theta[:, 0] >= 50) == (experiment == BETA_BINOMIAL)).all()
-
-
-# The stand-in ------------------------------------------------------------------------
-
-
-def test_with_a_stand_in_no_variant_needs_files() -> None:
-    for variant in (None, *LightTunnel.variants):
-        task = LightTunnel(variant=variant, stand_in=True, image_size=SIZE)
-        assert task.required_files == ()
-        assert task.has_data
-    synthetic = LightTunnel(variant="synthetic", image_size=SIZE).get_test_set(5)
-    standard = LightTunnel(stand_in=True, image_size=SIZE).get_test_set(5)
-    assert torch.equal(synthetic[0], standard[0])
-    assert torch.equal(synthetic[1], standard[1])
-
-
-@pytest.mark.medium
-def test_the_stand_in_draws_parameters_as_the_experiments_did() -> None:
-    beta = Beta(torch.tensor(5.0), torch.tensor(5.0)).stddev * 255
-    for variant, crowded in (
-        ("synthetic", (False, False)),
-        ("flipped", (False, False)),
-        ("biased_calibration", (True, False)),
-        ("misspecified_prior", (True, True)),
-    ):
-        task = LightTunnel(variant=variant, stand_in=True, image_size=SIZE)
-        sets = task.get_calibration_set(400)[0], task.get_test_set(400)[0]
-        for theta, in_the_middle in zip(sets, crowded, strict=True):
-            std = float(beta) if in_the_middle else 255 / 12**0.5
-            colours = theta[:, :3]
-            assert colours.std() == pytest.approx(std, rel=0.1)
-            assert torch.equal(colours, colours.round()) == in_the_middle

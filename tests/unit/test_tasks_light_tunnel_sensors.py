@@ -1,6 +1,5 @@
 """The light tunnel's sensors: law, prior and recorded data."""
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,13 +8,11 @@ import torch
 from sbi.utils import within_support
 from torch import Tensor
 
-from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.distributions import UniformDistance
 from sbi_rope.tasks.light_tunnel_sensors import (
     DATASET,
     INPUTS,
     OUTPUTS,
-    OWN_EXPERIMENTS,
     LightTunnelSensors,
     LightTunnelSimulator,
 )
@@ -104,22 +101,6 @@ def test_noise_is_relative_on_light_and_additive_on_the_current() -> None:
     assert current.std() == pytest.approx(4.0, rel=0.03)
 
 
-def test_negative_readings_are_cut_off_at_zero() -> None:
-    theta = torch.tensor([[-0.5, -0.5, -0.5, 0.0]])
-    assert (LightTunnelSimulator().readings(theta)[:, :6] < 0).all()
-    assert (LightTunnelSimulator()(theta)[:, :6] == 0).all()
-
-
-# The prior ---------------------------------------------------------------------------
-
-
-def test_prior_log_density_is_analytic() -> None:
-    prior = LightTunnelSensors().get_prior()
-    theta = torch.tensor([[0.0, 85.0, 42.0, 0.0], [0.0, 85.0, 42.0, 30.0]])
-    expected = [-3 * math.log(86) + math.log(2 * (40 - d) / 1600) for d in (0, 30)]
-    torch.testing.assert_close(prior.log_prob(theta), torch.tensor(expected))
-
-
 # Recorded data -----------------------------------------------------------------------
 
 
@@ -145,27 +126,6 @@ def test_all_6000_recorded_parameters_follow_the_prior(chamber_root: Path) -> No
     assert (distance < torch.tensor([0.02, 0.02, 0.02, 0.05])).all()
 
 
-def test_other_experiments_can_be_chosen(chamber_extract: Path) -> None:
-    simulator = LightTunnelSimulator()
-    for experiment, exposure_is_shorter in (
-        ("uniform_reference", False),
-        ("uniform_l_11_mid", False),
-        ("uniform_t_ir_1_strong", True),
-    ):
-        task = LightTunnelSensors(root=chamber_extract, experiment=experiment)
-        theta, x = task.get_test_set(20)
-        shift = (x - simulator.readings(theta).log1p())[:, 0].mean()
-        assert (shift < -1.5) == exposure_is_shorter
-
-
-def test_experiments_outside_of_the_prior_are_refused(chamber_extract: Path) -> None:
-    for experiment in ("uniform_red_strong", "uniform_pol_1_strong"):
-        task = LightTunnelSensors(root=chamber_extract, experiment=experiment)
-        match = f"{experiment}.*support of the prior"
-        with pytest.raises(InvalidInputError, match=match):
-            task.get_test_set(5)
-
-
 def test_a_recorded_row_becomes_the_parameters_and_the_observation(
     chamber_extract: Path,
 ) -> None:
@@ -188,36 +148,6 @@ def test_the_readings_come_in_the_order_of_the_simulator(
     assert row[6] == 1e6
 
 
-def test_a_recording_of_any_number_of_rows_is_data(write_table: WriteTable) -> None:
-    cycle = torch.arange(4000) % 41
-    task = LightTunnelSensors(root=write_table(4000))
-    assert task.num_recorded("calibration") == 1333
-    theta, x = all_recorded(task, 4000)
-    assert torch.equal(theta[:, 0].sort().values, cycle.sort().values.float())
-    assert torch.isfinite(x).all()
-    assert len(LightTunnelSensors(root=write_table(3)).get_test_set(2)[0]) == 2
-    with pytest.raises(InvalidInputError, match="at most 2"):
-        LightTunnelSensors(root=write_table(3)).get_test_set(3)
-
-
-def test_rows_that_are_no_data_are_refused(write_table: WriteTable) -> None:
-    changes = {"ir_1": "nan", "vis_1": -2, "red": 86, "pol_2": 31}
-    for column, value in changes.items():
-        task = LightTunnelSensors(root=write_table(**{column: value}))
-        with pytest.raises(InvalidInputError, match=r"uniform_reference\.csv"):
-            task.get_test_set(1)
-
-
-def test_a_task_knows_whether_its_files_are_there(
-    write_table: WriteTable, tmp_path: Path
-) -> None:
-    assert not LightTunnelSensors().has_data
-    assert not LightTunnelSensors(root=tmp_path).has_data
-    root = write_table()
-    assert LightTunnelSensors(root=root).has_data
-    assert not LightTunnelSensors(root=root, variant="sensor_settings").has_data
-
-
 # Variants ----------------------------------------------------------------------------
 
 
@@ -234,12 +164,6 @@ def test_strong_angles_are_42_to_118_degrees(chamber_extract: Path) -> None:
     theta = torch.cat([task.get_calibration_set(20)[0], task.get_test_set(40)[0]])
     assert theta[:, 3].min() == pytest.approx(44, abs=5.0)
     assert theta[:, 3].max() == pytest.approx(116, abs=5.0)
-
-
-def test_light_does_not_tell_an_angle_from_its_supplement() -> None:
-    theta = torch.tensor([[40.0, 50.0, 60.0, 70.0], [40.0, 50.0, 60.0, 110.0]])
-    x = LightTunnelSimulator().readings(theta)
-    torch.testing.assert_close(x[0], x[1])
 
 
 def test_sensor_settings_change_the_test_set_only(chamber_extract: Path) -> None:
@@ -261,9 +185,3 @@ def test_sensor_settings_change_the_test_set_only(chamber_extract: Path) -> None
     torch.testing.assert_close(
         share, torch.full_like(share, 1 / 7), atol=0.09, rtol=0.0
     )
-
-
-def test_variants_with_experiments_of_their_own_take_no_other() -> None:
-    for variant in OWN_EXPERIMENTS:
-        with pytest.raises(InvalidInputError, match="`experiment`"):
-            LightTunnelSensors(variant=variant, experiment="uniform_l_11_mid")

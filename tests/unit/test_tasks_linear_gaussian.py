@@ -4,13 +4,7 @@ import pytest
 import torch
 from torch.distributions import MultivariateNormal
 
-from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.linear_gaussian import LinearGaussian, LinearGaussianSimulator
-
-
-def test_matrix_couples_neighbours() -> None:
-    matrix = LinearGaussianSimulator(dim=3).matrix(torch.zeros(1))
-    assert matrix.tolist() == [[1, 0, 0], [0.5, 1, 0], [0, 0.5, 1]]
 
 
 def test_real_observations_are_scaled_and_shifted_simulations() -> None:
@@ -36,21 +30,6 @@ def test_true_posterior_is_that_of_the_joint_gaussian(dim: int) -> None:
     torch.testing.assert_close(posterior.mean, expected.mean)
     torch.testing.assert_close(
         posterior.covariance_matrix, expected.covariance_matrix.expand(5, -1, -1)
-    )
-
-
-def test_true_posterior_is_proportional_to_prior_times_likelihood() -> None:
-    task = LinearGaussian(dim=2)
-    _, x_o = task.get_test_set(1)
-    grid = torch.cartesian_prod(*[torch.linspace(-4, 4, 161)] * 2).double()
-    real = task._real
-    clean = real.observe(grid, torch.zeros_like(grid))
-    log_joint = -0.5 * (grid**2).sum(dim=1)
-    deviation = (x_o - clean) / (real.scale * real.noise_std)
-    log_joint = log_joint - 0.5 * (deviation**2).sum(dim=1)
-    density = log_joint.softmax(dim=0) / 0.05**2
-    torch.testing.assert_close(
-        task.get_true_posterior(x_o).log_prob(grid).exp(), density, atol=1e-6, rtol=1e-3
     )
 
 
@@ -89,21 +68,6 @@ def test_heavy_tails_have_outliers_that_a_gaussian_has_not() -> None:
     spread = error.flatten().quantile(0.75) - error.flatten().quantile(0.25)
     share = (error.abs() > 10 * spread / 1.349).double().mean()
     assert 0.001 < float(share) < 0.02
-
-
-@pytest.mark.parametrize("variant", ["curved", "heavy_tails"])
-def test_variants_without_a_closed_form_say_so(variant: str) -> None:
-    task = LinearGaussian(variant=variant)
-    assert not task.has_true_posterior
-    with pytest.raises(InvalidInputError, match=variant):
-        task.get_true_posterior(torch.zeros(1, 2))
-
-
-def test_gain_1_and_offset_0_make_the_simulator_exact() -> None:
-    task = LinearGaussian(scale=1.0, shift=0.0)
-    assert task._real == task.get_simulator()
-    exact = LinearGaussian(variant="well_specified")
-    assert exact._real == exact.get_simulator() == task.get_simulator()
 
 
 def test_parameters_observations_and_networks_have_the_dimension_asked_for() -> None:

@@ -1,46 +1,66 @@
-"""The embedding networks of the tasks."""
+"""The embedding networks of the tasks are those of the paper."""
 
+from itertools import pairwise
+
+import pytest
 import torch
 from torch import nn
 
-from sbi_rope.tasks.networks import SeriesEmbedding, fully_connected
+from sbi_rope.tasks import get_task
+from sbi_rope.tasks.networks import ImageEmbedding, SeriesEmbedding
+
+# Channels in and out, kernel, stride and dilation of convolutions.
+SERIES = [
+    (1, 16, 3, 1, 2),
+    (16, 64, 3, 2, 2),
+    (64, 128, 3, 1, 2),
+    (128, 128, 3, 2, 2),
+    (128, 128, 3, 1, 2),
+    (128, 128, 3, 2, 2),
+    (128, 128, 3, 1, 2),
+]
+IMAGES = [
+    (3, 64, 3, 2, 1),
+    (64, 128, 3, 2, 1),
+    (128, 128, 3, 2, 1),
+    (128, 64, 1, 1, 1),
+    (64, 3, 1, 1, 1),
+]
 
 
-def test_the_number_of_features_follows_the_length_of_the_series() -> None:
-    for num_steps, num_features in (
-        *((200, 2048), (193, 2048), (201, 2176), (100, 512), (1000, 14_848)),
-    ):
-        net = SeriesEmbedding(num_steps=num_steps, padding=1)
-        assert net.num_features == num_features
-        assert net(torch.randn(2, num_steps)).shape == (2, 10)
-
-
-def test_layers_are_those_of_the_paper() -> None:
-    net = SeriesEmbedding()
-    convolutions = [
+@pytest.mark.parametrize(
+    ("net", "convolutions", "widths"),
+    [
+        (SeriesEmbedding(), SERIES, [2048, 512, 128, 32, 10]),
+        (ImageEmbedding(), IMAGES, [27, 100, 20]),
+        (get_task("cs").get_embedding_net(), [], [4, 12, 48, 48, 36, 9]),
+        (get_task("sir").get_embedding_net(), [], [6, 8, 32, 32, 24, 6]),
+    ],
+    ids=["series", "images", "cs", "sir"],
+)
+def test_layers_are_those_of_the_paper(
+    net: nn.Module, convolutions: list[tuple[int, ...]], widths: list[int]
+) -> None:
+    found = [
         (m.in_channels, m.out_channels, m.kernel_size[0], m.stride[0], m.dilation[0])
         for m in net.modules()
-        if isinstance(m, nn.Conv1d)
+        if isinstance(m, nn.Conv1d | nn.Conv2d)
     ]
-    assert convolutions == [
-        (1, 16, 3, 1, 2),
-        (16, 64, 3, 2, 2),
-        (64, 128, 3, 1, 2),
-        (128, 128, 3, 2, 2),
-        (128, 128, 3, 1, 2),
-        (128, 128, 3, 2, 2),
-        (128, 128, 3, 1, 2),
-    ]
+    assert found == convolutions
     linear = [
         (m.in_features, m.out_features)
         for m in net.modules()
         if isinstance(m, nn.Linear)
     ]
-    assert linear == [(2048, 512), (512, 128), (128, 32), (32, 10)]
+    assert linear == list(pairwise(widths))
 
 
-def test_fully_connected_has_relu_between_layers_only() -> None:
-    net = fully_connected(3, (12, 48, 9))
-    kinds = [type(layer) for layer in net]
-    assert kinds == [nn.Linear, nn.ReLU, nn.Linear, nn.ReLU, nn.Linear]
-    assert net(torch.randn(5, 3)).shape == (5, 9)
+def test_the_number_of_features_follows_the_size_of_what_is_embedded() -> None:
+    for num_steps, num_features in ((200, 2048), (201, 2176), (1000, 14_848)):
+        net = SeriesEmbedding(num_steps=num_steps, padding=1)
+        assert net.num_features == num_features
+        assert net(torch.randn(2, num_steps)).shape == (2, 10)
+    for size, num_features in ((64, 12), (87, 27), (100, 27)):
+        image_net = ImageEmbedding(image_size=size)
+        assert image_net.num_features == num_features
+        assert image_net(torch.rand(2, 3, size, size)).shape == (2, 20)

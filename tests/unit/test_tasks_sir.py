@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.integrate import solve_ivp
-from torch import Tensor
 
 from sbi_rope.tasks.sir import (
     MONDAYS,
@@ -16,7 +15,6 @@ from sbi_rope.tasks.sir import (
     SUNDAYS,
     SIRSimulator,
     delay_weekend_reports,
-    integrate,
     summarise,
 )
 
@@ -95,26 +93,6 @@ def test_noise_has_the_variance_of_a_square_root_process() -> None:
     assert growth.mean() == pytest.approx(0.0, abs=0.005)
 
 
-@pytest.mark.slow
-def test_finer_steps_on_one_brownian_path_converge() -> None:
-    theta = SIR().get_prior().sample((200,)).double().T.numpy()
-    fine = torch.randn(364, 40, 200, dtype=torch.float64).numpy()
-
-    def log_numbers(steps: int) -> np.ndarray:
-        # Sums of increments are those of a coarser grid.
-        noise = fine.reshape(364, steps, 40 // steps, 200).sum(axis=2)
-        noise /= (40 / steps) ** 0.5
-        days = integrate(theta, noise, volatility=0.05)
-        return np.log(np.stack(list(days)))
-
-    finest = log_numbers(40)
-    errors = [((log_numbers(n) - finest) ** 2).mean() for n in (1, 4, 10)]
-    # First order: the squared error falls like the square of the step.
-    assert errors[1] < errors[0] / 10
-    assert errors[2] < errors[1] / 4
-    assert errors[2] < 0.05
-
-
 # The delay of reports ----------------------------------------------------------------
 
 
@@ -168,16 +146,6 @@ def test_means_under_the_prior_are_those_of_an_independent_implementation() -> N
     torch.testing.assert_close(x.std(dim=0), std, rtol=0.1, atol=0.0)
 
 
-@pytest.mark.slow
-def test_the_delay_of_reports_changes_the_autocorrelation_only() -> None:
-    theta = SIR().get_prior().sample((3000,))
-    simulated = seeded(SIRSimulator(), theta)
-    real = seeded(SIRSimulator(reported_fraction=0.95), theta)
-    shift = (real - simulated).mean(dim=0) / simulated.std(dim=0)
-    assert shift[5] == pytest.approx(-2.97, abs=0.3)
-    assert (shift[:5].abs() < 0.1).all()
-
-
 # The simulator -----------------------------------------------------------------------
 
 
@@ -186,27 +154,3 @@ def test_corners_of_the_prior_have_finite_statistics() -> None:
     x = SIRSimulator()(torch.tensor(corners))
     # With both rates at 0 the series is constant and has no correlation.
     assert x.isfinite().all(dim=1).tolist() == [True, True, True, False, True]
-
-
-# The task ----------------------------------------------------------------------------
-
-
-def test_density_and_quantiles_of_the_prior_are_analytic() -> None:
-    theta = SIR().get_prior().sample((4, 20))
-    log_prob = SIR().get_prior().log_prob(theta)
-    torch.testing.assert_close(log_prob, torch.full((4, 20), math.log(8)))
-    edges = torch.tensor([[0.0, 0.0], [0.5, 0.5], [0.25, 0.25]])
-    expected = torch.tensor([[0.0, 0.0], [1.0, 1.0], [0.25, 0.75]])
-    torch.testing.assert_close(SIR().prior_quantiles(edges), expected)
-
-
-def test_network_has_the_widths_of_the_paper() -> None:
-    for light in (False, True):
-        net = SIR().get_embedding_net(light=light)
-        widths = [layer.out_features for layer in net if hasattr(layer, "out_features")]
-        assert widths == [8, 32, 32, 24, 6]
-
-
-def seeded(simulator: SIRSimulator, theta: Tensor) -> Tensor:
-    torch.manual_seed(0)
-    return simulator(theta)

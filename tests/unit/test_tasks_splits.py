@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sbi_rope.errors import InvalidInputError, RoPEWarning, SimulationError
+from sbi_rope.errors import InvalidInputError, RoPEWarning
 from sbi_rope.tasks.splits import (
     MAX_SEED,
     DrawnPairs,
@@ -42,18 +42,6 @@ def test_streams_of_all_seeds_and_uses_differ() -> None:
     assert all(0 <= stream < 2**32 for stream in streams)
 
 
-def test_the_random_state_survives_an_error() -> None:
-    def fail(theta: Tensor) -> Tensor:
-        torch.rand(len(theta))
-        raise ZeroDivisionError
-
-    before = torch.get_rng_state()
-    pairs = DrawnPairs(draw_theta=lambda n: torch.rand(n, 1), observe=fail)
-    with pytest.raises(ZeroDivisionError):
-        pairs.take(3, seed=0, part="test")
-    assert torch.equal(before, torch.get_rng_state())
-
-
 def test_kept_pairs_follow_the_chances_and_begin_a_larger_set() -> None:
     sets = []
     for n in (10, 250):
@@ -85,15 +73,6 @@ def test_pairs_with_nan_are_replaced_jointly_and_counted() -> None:
     assert (theta[:, 0] >= 0.1).all()
 
 
-def test_a_process_without_valid_pairs_is_stopped_with_an_error() -> None:
-    pairs = DrawnPairs(
-        draw_theta=lambda n: torch.rand(n, 2),
-        observe=lambda theta: theta * torch.nan,
-    )
-    with pytest.raises(SimulationError, match="0 of 3 pairs"):
-        pairs.take(3, seed=0, part="test")
-
-
 # Recorded pairs ----------------------------------------------------------------------
 
 
@@ -111,27 +90,6 @@ def test_the_split_does_not_follow_the_order_of_the_file() -> None:
     rows = torch.tensor(recorded(3000).rows_of("calibration"))
     assert rows.double().mean() == pytest.approx(1500, abs=100)
     assert rows.double().std() == pytest.approx(3000 / 12**0.5, rel=0.05)
-
-
-def test_recorded_rows_without_a_chance_are_left_out() -> None:
-    pairs = recorded(3000)
-    theta, _ = pairs.take(
-        300, seed=0, part="calibration", keep=lambda t: (t[:, 0] < 1500).double()
-    )
-    assert (theta < 1500).all()
-    few, _ = pairs.take(
-        7, seed=0, part="calibration", keep=lambda t: (t[:, 0] < 1500).double()
-    )
-    assert torch.equal(few, theta[:7])
-
-
-def test_a_chance_between_0_and_1_thins_out_recorded_rows() -> None:
-    with pytest.raises(InvalidInputError) as raised:
-        recorded(3000).take(
-            1000, seed=0, part="calibration", keep=lambda t: 0.3 * torch.ones(len(t))
-        )
-    available = int(str(raised.value).split("at most ")[1].split(",")[0])
-    assert available == pytest.approx(300, abs=5 * (1000 * 0.3 * 0.7) ** 0.5)
 
 
 def test_asking_for_more_rows_than_there_are_names_their_number() -> None:

@@ -1,13 +1,10 @@
 """The wind tunnel: model, closed-form posterior, recorded data and stand-in."""
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
-from sbi.inference import NPE
-from sbi.neural_nets import posterior_nn
 from torch import Tensor
 from torch.distributions import Normal
 
@@ -28,7 +25,6 @@ HEADER = (
 AMBIENT = 95_742.9
 
 WriteImpulses = Callable[..., Path]
-Schedule = tuple[tuple[float, int, int], ...]  # learning rate, batch, epochs
 
 
 def known_timing() -> Tensor:
@@ -140,35 +136,6 @@ def test_pressure_is_linear_in_the_hatch_with_the_published_factor() -> None:
     torch.testing.assert_close((x[4] + x[5]) / 2, middle, rtol=0.0, atol=1e-12)
 
 
-@pytest.mark.slow
-def test_interpolated_pressures_are_exact_to_2e_5_pascal() -> None:
-    for jitter in (0.05, 0.3, 0.6):
-        shift = jitter * (2 * torch.rand(500, dtype=torch.float64) - 1)
-        theta = torch.zeros(500, 1, dtype=torch.float64)
-        simulator = WindTunnelSimulator(onset_jitter=jitter)
-        x = simulator.pressure(theta, onset_shift=shift)
-        direct = 74.82473949999999 * 0.25 * pressure_ratio(shift)
-        torch.testing.assert_close(x, direct, rtol=0.0, atol=2e-5)
-
-
-def test_before_the_impulse_the_fans_follow_the_equation_of_motion() -> None:
-    # Riccati's equation with constant torque: w = w_c tanh(w_c K t / I + c).
-    max_speed, inertia = 3000 * math.pi / 30, 0.5 * 0.059**2 * 0.02
-    drag = 0.05 * (0.27 - 0.166) / max_speed**2
-    ratio = pressure_ratio(known_timing())[0]
-    # The fan at the back slows down from 0.5 to 0.5^1.5 of its highest speed.
-    final = 0.5**1.5
-    times = torch.tensor(SAMPLE_TIMES, dtype=torch.float64)
-    rate = max_speed * drag / inertia * final
-    exhaust = final / torch.tanh(rate * times + math.atanh(final / 0.5))
-    # Before the impulse the front fan slows down from 0.1 to 0.1^1.5.
-    rest = 0.1**1.5
-    rate = max_speed * drag / inertia * rest
-    intake = rest / torch.tanh(rate * times + math.atanh(rest / 0.1))
-    expected = (intake**2 - exhaust**2)[:5]
-    torch.testing.assert_close(ratio[:5], expected, rtol=0.0, atol=1e-4)
-
-
 def test_noise_has_the_deviation_and_correlation_asked_for() -> None:
     theta = torch.full((20_000, 1), 20.0, dtype=torch.float64)
     for correlation in (0.0, 0.6):
@@ -183,31 +150,7 @@ def test_noise_has_the_deviation_and_correlation_asked_for() -> None:
         torch.testing.assert_close(noise.T.cov(), expected, rtol=0.0, atol=0.012)
 
 
-def test_shifts_are_uniform_up_to_the_jitter() -> None:
-    simulator = WindTunnelSimulator(noise_std=1e-9, onset_jitter=0.3)
-    x = simulator(torch.zeros(5000, 1, dtype=torch.float64))
-    # After the impulse, the pressure at a fixed time grows with its shift.
-    levels = torch.linspace(0.05, 0.95, 10, dtype=torch.float64)
-    grid = torch.linspace(-0.3, 0.3, 601, dtype=torch.float64)
-    fading = simulator.pressure(
-        torch.zeros(601, 1, dtype=torch.float64), onset_shift=grid
-    )[:, 30].contiguous()
-    assert (fading.diff() > 0).all()
-    shift = grid[torch.searchsorted(fading, x[:, 30].contiguous()).clamp(max=600)]
-    torch.testing.assert_close(
-        shift.quantile(levels), 0.6 * levels - 0.3, rtol=0.0, atol=0.02
-    )
-
-
 # The posterior at known timing -------------------------------------------------------
-
-
-def test_closed_form_posterior_has_the_known_width_and_score() -> None:
-    oracle = Oracle()
-    assert float(oracle.ratio.norm()) == pytest.approx(2.125, abs=1e-3)
-    assert oracle.std == pytest.approx(0.377, abs=1e-3)
-    score = -0.5 * math.log(2 * math.pi * math.e) - math.log(oracle.std)
-    assert score == pytest.approx(-0.444, abs=1e-3)
 
 
 @pytest.mark.medium
@@ -218,84 +161,6 @@ def test_simulations_follow_the_closed_form_posterior() -> None:
     distance = (levels - torch.linspace(0, 1, 20_000)).abs().max()
     assert distance < 1.63 / 20_000**0.5  # the 1 % point of Kolmogorov's test
     assert float(oracle.log_prob(theta, x).mean()) == pytest.approx(-0.444, abs=0.03)
-
-
-def train_npe(task: WindTunnel, num: int, build: Callable, schedule: Schedule) -> NPE:
-    theta, x = task.get_simulations(num)
-    npe = NPE(task.get_prior(), density_estimator=build, show_progress_bars=False)
-    npe.append_simulations(theta, x)
-    for learning_rate, batch, epochs in schedule:
-        npe.train(
-            learning_rate=learning_rate,
-            training_batch_size=batch,
-            max_num_epochs=epochs,
-            force_first_round_loss=True,
-        )
-    return npe
-
-
-def distance_from_the_oracle(npe: NPE, task: WindTunnel) -> float:
-    """Difference of the scores on the same simulations, in nats."""
-    theta, x = task.get_test_set(2000)
-    log_prob = npe.build_posterior().log_prob_batched(
-        theta.unsqueeze(0), x=x, norm_posterior=False
-    )
-    return float(Oracle().log_prob(theta, x).mean() - log_prob.double().mean())
-
-
-@pytest.mark.filterwarnings("ignore:Maximum number of epochs")
-@pytest.mark.slow
-def test_npe_with_the_light_network_reaches_the_closed_form() -> None:
-    task = WindTunnel(variant="well_specified", onset_jitter=0.0)
-    # Each time is scaled by itself: with one scale for the whole curve, the mean curve
-    # is four times as large as what the hatch changes, and training takes longer.
-    build = posterior_nn(
-        "nsf",
-        embedding_net=task.get_embedding_net(light=True),
-        num_transforms=1,
-        hidden_features=30,
-        z_score_x="independent",
-    )
-    schedule = ((2e-3, 100, 10), (3e-4, 200, 8), (5e-5, 500, 4))
-    npe = train_npe(task, 20_000, build, schedule)
-    assert distance_from_the_oracle(npe, task) == pytest.approx(0.0, abs=0.1)
-
-
-# The task ----------------------------------------------------------------------------
-
-
-def test_prior_log_density_is_analytic() -> None:
-    theta = torch.tensor([[0.0], [22.5], [44.9]])
-    log_prob = WindTunnel().get_prior().log_prob(theta)
-    torch.testing.assert_close(log_prob, torch.full((3,), -math.log(45)))
-    quantiles = WindTunnel().prior_quantiles(theta)
-    torch.testing.assert_close(quantiles, theta / 45)
-
-
-# The stand-in ------------------------------------------------------------------------
-
-
-def test_files_are_needed_unless_there_is_a_stand_in_or_nothing_to_read() -> None:
-    for options in (
-        {"variant": "synthetic"},
-        *({"variant": v, "stand_in": True} for v in (None, *WindTunnel.variants)),
-    ):
-        task = WindTunnel(**options)
-        assert task.required_files == ()
-        assert task.has_data
-    assert WindTunnel().required_files == (Path(DATASET, f"{EXPERIMENT}.csv"),)
-    assert not WindTunnel().has_data
-    assert WindTunnel(variant="well_specified").required_files == ()
-
-
-@pytest.mark.slow
-def test_to_the_simulator_the_stand_in_looks_like_a_hatch_that_is_open_wider() -> None:
-    theta, x = WindTunnel(variant="synthetic", onset_jitter=0.0).get_test_set(2000)
-    error = Oracle().estimate(x) - theta[:, 0]
-    # Far more than the posterior's 0.38 degrees, far less than the prior's width.
-    closed, half_open = theta[:, 0] < 10, (theta[:, 0] > 18) & (theta[:, 0] < 27)
-    assert float(error[closed].mean()) == pytest.approx(10.0, abs=1.5)
-    assert float(error[half_open].mean()) == pytest.approx(7.5, abs=1.5)
 
 
 # Recorded data -----------------------------------------------------------------------
