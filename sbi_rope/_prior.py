@@ -11,8 +11,6 @@ from torch.distributions import Distribution, constraints
 from sbi_rope._random import seeded
 from sbi_rope.errors import InvalidInputError, shown
 
-__all__ = ["PriorDistribution", "divisors"]
-
 # Draws from which moments are estimated that a prior does not state, and those that are
 # moved apart to see whether it has bounds.
 NUM_FOR_MOMENTS, NUM_DRAWS, FAR_APART = 10_000, 256, 5.0

@@ -6,8 +6,6 @@ from typing import Any
 
 from tqdm.auto import tqdm
 
-__all__ = ["is_shown", "progress_bar"]
-
 # A bar is drawn again after so many seconds at the earliest. In a file every drawing
 # stays, so that there are fewer of them.
 SECONDS_ON_SCREEN, SECONDS_IN_FILE = 0.1, 10.0

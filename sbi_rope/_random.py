@@ -9,8 +9,6 @@ import torch
 
 from sbi_rope.settings import Seed, check
 
-__all__ = ["seeded"]
-
 
 @contextmanager
 def seeded(seed: int | None) -> Iterator[None]:

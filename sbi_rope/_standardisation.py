@@ -6,14 +6,6 @@ from torch import Tensor, nn
 from sbi_rope._sbi import standardisation_of
 from sbi_rope.errors import warn_user
 
-__all__ = [
-    "FAR",
-    "ROUNDING",
-    "Standardisation",
-    "deviations",
-    "warn_of_far_entries",
-]
-
 # An entry is far if it is more than so many standard deviations away from simulations.
 # No measurement of the tasks is half as far away. A column that is constant in
 # simulations but varies by 0.01 in reality is 100,000 away.

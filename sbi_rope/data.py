@@ -15,20 +15,6 @@ from torch import Tensor
 from sbi_rope._random import seeded
 from sbi_rope.errors import InvalidInputError
 
-__all__ = [
-    "MIN_PAIRS_FOR_HOLDOUT",
-    "Counts",
-    "Labels",
-    "Nodes",
-    "Pairs",
-    "groups_of",
-    "groups_to_hold_out",
-    "one_of_each_group",
-    "split_groups",
-    "split_pairs",
-    "too_few_pairs",
-]
-
 # Fewer groups than this leave nothing to hold out.
 MIN_PAIRS_FOR_HOLDOUT = 5
 

@@ -16,18 +16,6 @@ from sbi_rope.ensemble import resize
 from sbi_rope.errors import RoPEWarning, warn_user
 from sbi_rope.settings import Count, Level, Positive, Settings
 
-__all__ = [
-    "EPOCHS_WITHOUT_HOLDOUT",
-    "Courses",
-    "History",
-    "Training",
-    "epochs_on_pairs",
-    "fit",
-    "fit_on_pairs",
-    "shuffled",
-    "without_warning_of_few_pairs",
-]
-
 # Without a hold-out nothing says when to stop, so little is risked.
 EPOCHS_WITHOUT_HOLDOUT = 50
 # More epochs than this are no limit.

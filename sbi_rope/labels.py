@@ -26,18 +26,6 @@ from sbi_rope.errors import InvalidInputError, warn_user
 from sbi_rope.settings import default_names
 from sbi_rope.tensors import as_batch, as_numbers, check_in_support, rows_with
 
-__all__ = [
-    "Reference",
-    "draws_of",
-    "given_groups",
-    "given_labels",
-    "given_weights",
-    "nodes_of",
-    "on_bounds",
-    "place_nodes",
-    "reference_of",
-]
-
 # A covariance may be this much asymmetric, relative to its diagonal, and a correlation
 # with a smaller eigenvalue than the second number is singular.
 ROUNDING, SINGULAR = 1e-6, 1e-12

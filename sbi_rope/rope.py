@@ -38,8 +38,6 @@ from sbi_rope.settings import Count, check
 from sbi_rope.simulate import Source, moments, source_of, targets
 from sbi_rope.tensors import as_numbers, check_same_length, column_names, rows_with
 
-__all__ = ["EmbeddedBatch", "RoPE"]
-
 # The number of simulations to couple with if the batch has fewer observations.
 MIN_SIMULATIONS = 1000
 

@@ -34,8 +34,6 @@ from sbi_rope._sbi import BasePotential, NeuralPosterior
 from sbi_rope.errors import DataNotFoundError, FileFormatError
 from sbi_rope.settings import check
 
-__all__ = ["load", "save"]
-
 LAWS = (Distribution, Transform)
 BASES = (nn.Module, *LAWS, Constraint, NeuralPosterior, BasePotential)
 # Other posteriors of sbi run more code when they are loaded.

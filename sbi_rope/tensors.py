@@ -11,15 +11,6 @@ from torch import Tensor
 from sbi_rope._prior import PriorDistribution
 from sbi_rope.errors import InvalidInputError
 
-__all__ = [
-    "as_batch",
-    "as_numbers",
-    "check_in_support",
-    "check_same_length",
-    "column_names",
-    "rows_with",
-]
-
 
 def as_batch(
     name: str,

@@ -19,8 +19,6 @@ from sbi_rope.errors import CouplingError, warn_user
 from sbi_rope.settings import Count, Positive, Settings, UnitInterval
 from sbi_rope.tensors import as_batch
 
-__all__ = ["Coupling", "SinkhornCoupler"]
-
 # With fewer observations than this, few of them decide how the coupling is balanced.
 SMALL_BATCH = 20
 # The largest number of distances to store: 0.4 GB in float64, and as much again for the

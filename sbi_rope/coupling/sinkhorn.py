@@ -24,16 +24,6 @@ import ot
 import torch
 from torch import Tensor
 
-__all__ = [
-    "Distances",
-    "Kernel",
-    "Solution",
-    "marginal_error",
-    "row_blocks",
-    "solve_fixed_point",
-    "solve_pot",
-]
-
 # Entries of a block: few enough for the caches of a CPU core, and enough to occupy a
 # GPU. Blocks also bound the memory of everything that is not stored.
 CPU_BLOCK, GPU_BLOCK = 2**17, 2**24

@@ -14,8 +14,6 @@ from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalDensityEstimator
 from sbi_rope.errors import InvalidInputError, warn_user
 
-__all__ = ["Accept", "Density", "Given", "Prior", "batches", "num_fitting"]
-
 # sbi converts every x to this dtype, and its estimators work in no other.
 DTYPE = torch.float32
 

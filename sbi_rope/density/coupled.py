@@ -23,8 +23,6 @@ from sbi_rope.density.base import (
 from sbi_rope.ensemble import drawn, log_density
 from sbi_rope.errors import InvalidInputError, warn_user
 
-__all__ = ["Coupled", "OverSimulations"]
-
 
 class OverSimulations(Density):
     r"""A density that is mixed over simulations, with weights that depend on x.

@@ -26,8 +26,6 @@ from sbi_rope.density.base import (
 )
 from sbi_rope.ensemble import Ensemble, drawn, embedded, log_density, loss_of
 
-__all__ = ["Flow"]
-
 # Observations in one call of the embedding nets.
 NET_BATCH = 1000
 

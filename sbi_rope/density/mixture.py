@@ -17,8 +17,6 @@ from sbi_rope.density.posterior import MixturePosterior
 from sbi_rope.errors import InvalidInputError, shown
 from sbi_rope.settings import check
 
-__all__ = ["Mixture", "average", "density_of"]
-
 # Draws of the first prior, at which the others must have the same density.
 NUM_FROM_PRIOR = 100
 

@@ -35,8 +35,6 @@ from sbi_rope.sets.makes_sets import MakesSets
 from sbi_rope.settings import Count, Positive, check
 from sbi_rope.tensors import as_batch, as_numbers, rows_with
 
-__all__ = ["MixturePosterior", "PriorPosterior"]
-
 # An observation is slow if, after MIN_PROPOSALS proposals, less than a share of
 # MIN_ACCEPTANCE of them lies inside the prior's support. Rejection sampling gives up on
 # slow observations if they would take more than MAX_PROPOSALS further proposals, which

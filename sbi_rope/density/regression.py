@@ -13,8 +13,6 @@ from torch.distributions import Chi2
 from sbi_rope._sbi import embed
 from sbi_rope.density.base import Density
 
-__all__ = ["GaussianProcess"]
-
 # More entries than these are reduced to principal components, at most so many.
 MAX_ENTRIES, MAX_COMPONENTS = 20, 10
 # Medians of the length scales, relative to the root of the number of inputs, of the

@@ -32,8 +32,6 @@ from sbi_rope.trainers.training import estimator_builder, train_on_simulations
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["Kind", "Method"]
-
 Kind = Literal["simulations", "calibration", "observations"]
 # What data are called in messages, and the call that takes them.
 DATA: dict[Kind, tuple[str, str]] = {

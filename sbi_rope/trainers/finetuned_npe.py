@@ -20,8 +20,6 @@ from sbi_rope.trainers.training import EstimatorBuilder
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["FinetunedNPE"]
-
 
 class FinetunedNPE(Method):
     r"""NPE trained on simulations, then as a whole on the calibration pairs.

@@ -15,8 +15,6 @@ from sbi_rope.errors import InvalidInputError
 from sbi_rope.fit import History, Training
 from sbi_rope.settings import check
 
-__all__ = ["EstimatorBuilder", "estimator_builder", "train_on_simulations"]
-
 # Returns an untrained estimator for pairs (theta, x) like those it is shown.
 EstimatorBuilder = Callable[[Tensor, Tensor], Any]
 MIN_SIMULATIONS = 20
