@@ -318,7 +318,7 @@ def split_pairs(
 
     Groups are held out as a whole, in random order, as long as they bring the number of
     rows nearer to the fraction asked for, or else the smallest. Of fewer than five
-    groups none is held out. The first argument is that of :func:`groups_of`.
+    groups none is held out.
     """
     groups = groups_of(theta_or_groups)
     sizes = torch.bincount(groups)
@@ -339,9 +339,8 @@ def split_groups(groups: Tensor, num_folds: int) -> list[Tensor]:
     There are at most as many folds as groups, with equally many rows as far as the
     groups allow.
     """
-    # Not by scikit-learn's GroupKFold: it refuses fewer groups than folds, and in which
-    # order it takes groups of equal size depends on its version. Stored results depend
-    # on who was in which fold.
+    # scikit-learn's GroupKFold refuses fewer groups than folds, and in which order it
+    # takes groups of equal size depends on its version.
     groups = groups_of(groups)
     sizes = torch.bincount(groups)
     order = torch.randperm(len(sizes))
@@ -358,9 +357,9 @@ def split_groups(groups: Tensor, num_folds: int) -> list[Tensor]:
 
 
 def groups_to_hold_out(wanted: int, sizes: list[int]) -> list[int]:
-    """Choose groups of these sizes, in this order, with about as many rows as wanted.
+    """Choose some groups of these sizes, in order, with about as many rows as wanted.
 
-    Some are chosen, but not all. If all groups are too large, it is the smallest.
+    If all groups are too large, it is the smallest.
     """
     chosen, total = [], 0
     for index, size in enumerate(sizes):

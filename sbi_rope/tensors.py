@@ -1,6 +1,5 @@
 """The one place where data of a user become tensors, and are checked."""
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -25,6 +24,9 @@ def as_batch(
 ) -> Tensor:
     """Return a user's data as a tensor of shape ``(n, *event_shape)``.
 
+    It has no gradients. A floating-point tensor keeps its dtype, and all else becomes
+    float32.
+
     Args:
         name: What the argument is called.
         value: A tensor, an array, a table, or a list of numbers.
@@ -32,13 +34,8 @@ def as_batch(
         rows: The number of rows; any if None.
         device: Where the tensor has to be, and where arrays and lists are moved.
         names: Names of columns. A table that has them in another order is put in order.
-        finite: Whether NaN and Inf are errors. An array or a list becomes float32, in
-            which numbers beyond 3e38 are infinite.
+        finite: Whether NaN and Inf are errors.
         empty: Whether n may be 0.
-
-    Returns:
-        A tensor without gradients. A floating-point tensor keeps its dtype, and all
-        else becomes float32.
     """
     numbers = as_numbers(name, value, device=device, names=names)
     shape = tuple(numbers.shape)
@@ -139,7 +136,4 @@ def _hint(name: str, shape: tuple[int, ...], event: tuple[int, ...]) -> str:
         return f" For a single row pass `{name}[None]`."
     if len(shape) == 1 and event == (1,):
         return f" For one number in each row pass `{name}[:, None]`."
-    if event != shape[1:] and event and math.prod(shape[1:]) == math.prod(event):
-        sizes = ", ".join(map(str, event))
-        return f" If the order of the entries fits, pass `{name}.reshape(-1, {sizes})`."
     return ""
