@@ -108,7 +108,7 @@ class RoPE:
 
     Args:
         posterior: What ``NPE(...).build_posterior()`` returns, or the posterior of
-            MNPE, FMPE or NPSE (the last two have no ``log_prob``), trained in one round.
+            MNPE, FMPE or NPSE (these two without ``log_prob``), trained in one round.
         simulator: Maps parameters ``(n, d)`` to simulations ``(n, *event)``, or one
             ``(d,)`` to one ``(*event)``. It may take tensors or NumPy arrays (of
             float64), and return either, lists, or numbers. A row of x may depend on the

@@ -33,12 +33,14 @@ from sbi_rope.settings import check
 LAWS = (Distribution, Transform)
 BASES = (nn.Module, *LAWS, Constraint, NeuralPosterior, BasePotential)
 # Other posteriors of sbi run more code when they are loaded.
-ROOMS = tuple(
-    """torch.nn.modules. torch.distributions. zuko. nflows.distributions. nflows.flows.
-    nflows.nn. nflows.transforms. sbi.inference.posteriors.direct_posterior.
-    sbi.inference.posteriors.npe_a_posterior. sbi.neural_nets. sbi.utils.
-    sbi.inference.posteriors.vector_field_posterior. sbi.inference.potentials.
-    sbi.samplers.ode_solvers. sbi_rope.""".split()
+ROOMS = (
+    *("torch.nn.modules.", "torch.distributions.", "zuko."),
+    *("nflows.distributions.", "nflows.flows.", "nflows.nn.", "nflows.transforms."),
+    "sbi.inference.posteriors.direct_posterior.",
+    "sbi.inference.posteriors.npe_a_posterior.",
+    "sbi.inference.posteriors.vector_field_posterior.",
+    *("sbi.inference.potentials.", "sbi.neural_nets.", "sbi.samplers.ode_solvers."),
+    *("sbi.utils.", "sbi_rope."),
 )
 # Dataclasses of these rooms are results. Others call what they hold, or run programs.
 RESULTS = (
@@ -53,13 +55,17 @@ OTHERS = (
     "zuko.flows.spline.CircularRQSTransform",
     "nflows.transforms.linear.LinearCache",
 )
-ACTIVATIONS = """celu elu hardswish hardtanh leaky_relu mish relu relu6 selu silu
-softmax softsign tanhshrink""".split()
+ACTIVATIONS = (
+    *("celu", "elu", "hardswish", "hardtanh", "leaky_relu", "mish", "relu", "relu6"),
+    *("selu", "silu", "softmax", "softsign", "tanhshrink"),
+)
 # Pickle finds these as attributes: functions of torch, and methods of vector fields.
 # Some other methods write files.
 OF_TORCH = ("exp", "relu", "selu", "sigmoid", "sin", "tanh")
-METHODS = """ode_fn _f_condition_last _identity_weight_fn _max_likelihood_weight_fn
-_variance_weight_fn""".split()
+METHODS = (
+    *("ode_fn", "_f_condition_last", "_identity_weight_fn"),
+    *("_max_likelihood_weight_fn", "_variance_weight_fn"),
+)
 
 
 def save(posterior: Any, path: str | Path, *, overwrite: bool = False) -> None:

@@ -23,8 +23,7 @@ MIN_SIMULATIONS = 20
 def estimator_builder(density_estimator: Any) -> EstimatorBuilder:
     """Return a builder of untrained estimators, from a name or from a builder.
 
-    sbi's builders put the network they were given into what they build, and training
-    then changes it. Ours builds from a copy, so that several methods can share one.
+    It copies the network that it was given, so that several methods can share one.
     """
     check("density_estimator", density_estimator, str | Callable)
     # It holds the name, because sbi's builders cannot be pickled.
