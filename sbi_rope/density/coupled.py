@@ -78,9 +78,8 @@ class OverSimulations(Density):
         for pairs in batches(torch.arange(len(theta) * len(row), device=theta.device)):
             sample, k = pairs // len(row), pairs % len(row)
             points = without_nan_gradients(theta[sample, row[k]])
-            log_terms.append(
-                log_density(self.density, points, self.simulated[column[k]])
-            )
+            of_pairs = log_density(self.density, points, self.simulated[column[k]])
+            log_terms.append(of_pairs)
         log_q = without_nan(torch.cat(log_terms)).double()
         return log_q.reshape(len(theta), len(row))
 
@@ -89,11 +88,9 @@ class OverSimulations(Density):
         """Draw once for each of n numbers of observations, ``(n, d)``."""
         used, place = row.unique(return_inverse=True)
         column, size = torch.empty_like(row), num_fitting(len(self.simulated))
-        for start, some in zip(
-            range(0, len(used), size), used.split(size), strict=True
-        ):
-            mine = (place >= start) & (place < start + size)
-            column[mine] = _chosen(self.rows(z[some]), place[mine] - start)
+        for number, some in enumerate(used.split(size)):
+            mine = place // size == number
+            column[mine] = _chosen(self.rows(z[some]), place[mine] % size)
         theta = [drawn(self.density, self.simulated[some]) for some in batches(column)]
         return torch.cat(theta)
 
@@ -124,7 +121,7 @@ class Coupled(OverSimulations):
         net: The embedding net g of real observations, for unseen ones.
         coupling: The coupling of :math:`g(x_o)` with the simulations.
         unseen: What to do with an x outside the batch: ``"raise"`` an error, or
-            ``"extend"`` the coupling by a softmax row under the same potential.
+            ``"extend"`` the coupling by a row under the same potential.
     """
 
     x_o: Tensor
@@ -214,10 +211,9 @@ class Coupled(OverSimulations):
 
 
 def without_tail(weights: Tensor, tail_mass: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Return row, column and log weight of the entries of weights to evaluate.
+    """Return row, column and log weight of all weights but the smallest of each row.
 
-    The smallest weights of each row are left out, as long as they sum to at most
-    ``tail_mass``.
+    These sum to at most ``tail_mass``.
     """
     # The sum starts at the smallest weights, so that rounding does not lose them.
     ascending, order = weights.sort(dim=1)
@@ -257,8 +253,7 @@ def _chosen(weights: Tensor, row: Tensor) -> Tensor:
 
 def _keys(x: Tensor) -> list[bytes]:
     """Return a fingerprint of each row's values."""
-    # Adding zero turns -0.0 into 0.0. The two are equal, and so should their bytes be.
-    # The same holds for the NaN of missing entries, whose bits may differ.
+    # Adding zero turns -0.0 into 0.0. NaN may have different bits, too.
     rows = x.detach().cpu().flatten(1) + 0.0
     rows = rows.where(~rows.isnan(), torch.nan).contiguous().numpy()
     return [hashlib.blake2b(row.tobytes(), digest_size=16).digest() for row in rows]

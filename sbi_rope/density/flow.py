@@ -76,11 +76,9 @@ class Flow(Density):
         *,
         nets: Sequence[nn.Module] | None = None,
     ) -> "Flow":
-        """Return the average of copies of estimators of one architecture.
+        """Return the average of copies of estimators of sbi, of one architecture.
 
-        Args:
-            estimators: Estimators of sbi. The same one may appear several times.
-            nets: Embedding nets in the place of their own.
+        The same one may appear several times. The ``nets`` take the place of their own.
         """
         first = estimators[0]
         own = {id(one): embedding_of(one) for one in estimators}
@@ -101,13 +99,11 @@ class Flow(Density):
 
     @classmethod
     def joined(cls, flows: "Sequence[Flow]") -> "Flow":
-        """Return the average of flows that come from one NPE, with equal weights.
-
-        Where all have the same net, or the same density, the average has one, too.
-        """
+        """Return the average of flows that come from one NPE, with equal weights."""
         parts = []
         for of_each in zip(*((one.nets, one.densities) for one in flows), strict=True):
             first = of_each[0]
+            # Where all have the same net, or density, the average has one, too.
             if all(len(one) == 1 and _are_equal(one, first) for one in of_each):
                 parts.append(copy.deepcopy(first))
                 continue
@@ -138,10 +134,9 @@ class Flow(Density):
     def made_of(
         self, members: Sequence[tuple[int, int]], nets: Ensemble | None = None
     ) -> "Flow":
-        """Return the average of copies of some nets and densities.
+        """Return the average of copies of some nets and densities, named by numbers.
 
-        Each flow is named by the number of its net and that of its density. The nets
-        may take the place of those of this flow.
+        The ``nets`` may take the place of those of this flow.
         """
         of_nets, of_densities = zip(*members, strict=True)
         own = self.nets if nets is None else nets
@@ -202,9 +197,8 @@ class Flow(Density):
 
     def log_q(self, theta: Tensor, z: Tensor) -> Tensor:
         """Return the log density at theta ``(S, B, d)``, shape ``(S, B)``, float64."""
-        return (self.log_probs(theta, z) + self.weights.log()[:, None, None]).logsumexp(
-            0
-        )
+        log_weights = self.weights.log()[:, None, None]
+        return (self.log_probs(theta, z) + log_weights).logsumexp(0)
 
     def log_probs(self, theta: Tensor, z: Tensor) -> Tensor:
         """Return the log density of each flow at theta, ``(E, S, B)``, float64."""
@@ -212,9 +206,7 @@ class Flow(Density):
         theta = theta.flatten(0, 1)
         row = torch.arange(shape[1], device=theta.device).repeat(shape[0])
         parts = []
-        for pairs in batches(
-            torch.arange(len(theta), device=theta.device), share=count
-        ):
+        for pairs in batches(torch.arange(len(theta)).to(row), share=count):
             of_each = z[row[pairs]].expand(-1, count, -1).transpose(0, 1)
             points = theta[pairs].expand(count, -1, -1).flatten(0, 1)
             log_probs = self.densities.answer(

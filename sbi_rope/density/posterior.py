@@ -14,10 +14,7 @@ from torch.distributions import Distribution
 from sbi_rope._prior import PriorDistribution
 from sbi_rope._progress import is_shown, progress_bar
 from sbi_rope._random import seeded
-from sbi_rope._sbi import (
-    BaseDirectPosterior,
-    MixedDensity,
-)
+from sbi_rope._sbi import BaseDirectPosterior, MixedDensity
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope.coupling import Coupling
 from sbi_rope.density.base import (
@@ -40,8 +37,7 @@ from sbi_rope.tensors import as_batch, as_numbers, rows_with
 # slow observations if they would take more than MAX_PROPOSALS further proposals, which
 # are minutes. In a stack the prior often keeps a share just below MIN_ACCEPTANCE.
 MIN_PROPOSALS, MIN_ACCEPTANCE, MAX_PROPOSALS = 100_000, 1e-3, 10_000_000
-# Observations for which this many proposals were all rejected are counted together: if
-# a whole batch lies outside the support, MIN_PROPOSALS for all of it are enough.
+# Observations for which this many proposals were all rejected are counted together.
 MIN_WITHOUT_ANY = 5_000
 # A flow takes about as long for this many draws as for a single one.
 SMALL_BATCH = 512
@@ -61,12 +57,9 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         \qquad Z_i = \sum_j \alpha_{ij} Z_j .
 
     It has all methods of sbi's :class:`DirectPosterior` and works with sbi's
-    diagnostics. That of RoPE belongs to a batch of observations: diagnostics such as
-    simulation-based calibration only make sense for its ``x_o`` and their true
-    parameters. Others are amortised and answer any x.
-
-    Apart from arguments and result it needs some 150 MB. A matrix of size n_o x n_s is
-    never held.
+    diagnostics. That of RoPE belongs to a batch of observations, its ``x_o``. Others
+    are amortised and answer any x. Apart from arguments and result it needs some 150
+    MB.
 
     References:
         | Addressing Misspecification in Simulation-based Inference through Data-driven
@@ -96,12 +89,17 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         # A category that sbi has standardised and put back may differ by rounding, and
         # is no category then.
         is_mixed = any(isinstance(part, MixedDensity) for part in density.modules())
+        enable_transform = enable_transform and not is_mixed
+        self._set_up(density, PriorDistribution(prior), enable_transform)
+
+    def _set_up(self, density: Density, prior: Any, enable_transform: bool) -> None:  # noqa: FBT001
         with seeded(0):  # sbi draws from the prior to find out about it
-            super().__init__(
+            BaseDirectPosterior.__init__(
+                self,
                 density,
-                PriorDistribution(prior),
-                device=density.device,
-                enable_transform=enable_transform and not is_mixed,
+                prior,
+                device=str(density.device),
+                enable_transform=enable_transform,
             )
         self.posterior_estimator: Density = density
 
@@ -179,14 +177,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         x, self._latest = self.default_x, None
         self.prior.to(device)
         density = self.posterior_estimator.to(device)
-        with seeded(0):  # sbi draws from the prior to find out about it
-            BaseDirectPosterior.__init__(
-                self,
-                density,
-                self.prior,
-                device=str(density.device),
-                enable_transform=self.enable_transform,
-            )
+        self._set_up(density, self.prior, self.enable_transform)
         if x is not None:
             self._keep_default_x(x)
 
@@ -229,11 +220,8 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         return x
 
     def _parameters(self, theta: Any, *, batched: bool = False) -> Tensor:
-        """Return parameters in float32, ``(n, d)``, or ``(S, B, d)`` of a batch.
-
-        A bound of the prior is one in float32 only: 0.1 of float64 is below the 0.1 of
-        a prior.
-        """
+        """Return parameters in float32, ``(n, d)``, or ``(S, B, d)`` of a batch."""
+        # A bound of the prior is one in float32 only: 0.1 of float64 is below it.
         dim = self.posterior_estimator.input_shape[0]
         numbers = as_numbers("theta", theta, names=self.parameter_names)
         theta = theta if isinstance(theta, Tensor) else numbers  # which has gradients
@@ -262,8 +250,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         r"""Draw from :math:`p(\theta \mid x)` of one observation.
 
         The default x is taken if there is none. The other arguments, and errors, are
-        those of :meth:`sample_batched`. Returns a tensor of shape
-        ``(*sample_shape, d)``.
+        those of :meth:`sample_batched`. The result has shape ``(*sample_shape, d)``.
         """
         x = self._one_x(x)
         return self.sample_batched(sample_shape, x, *args, **options).squeeze(-2)
@@ -319,16 +306,15 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         if reject_outside_prior:
             draw = _Rejection(draw, self.prior.inside, num_rows, density.device)
         theta = torch.empty(total, *density.input_shape, device=density.device)
+        show = is_shown(show_progress_bars)
         with (
             torch.no_grad(),
-            progress_bar(
-                show=is_shown(show_progress_bars), desc="Sampling", total=total
-            ) as bar,
+            progress_bar(show=show, desc="Sampling", total=total) as bar,
         ):
             # Observation by observation, so that few of them are needed at a time.
             for first in range(0, total, MAX_ENTRIES):
                 last = min(first + MAX_ENTRIES, total)
-                slot = torch.arange(first, last, device=density.device)
+                slot = torch.arange(first, last, device=theta.device)
                 row, number = slot // num_samples, slot % num_samples
                 theta[number * num_rows + row] = draw(row)
                 bar.update(len(slot))
@@ -369,7 +355,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         Parameters of shape ``(B, d)`` or ``(S, B, d)`` belong to observations
         ``(B, *event)``. One row of theta serves all observations, and one observation
         all rows of theta. The other arguments, and errors, are those of
-        :meth:`log_prob`. Returns a tensor of shape ``(1, B)`` or ``(S, B)``.
+        :meth:`log_prob`. The result has shape ``(1, B)`` or ``(S, B)``.
         """
         theta = self._parameters(theta, batched=True)
         x = self._warned_of(self._batch_of_x(x))
@@ -403,9 +389,8 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
     def map(self, x: Tensor | None = None, **options: Any) -> Tensor:  # type: ignore[override]
         """Return the maximum of the density given the default x, as in sbi, ``(1, d)``.
 
-        Every step evaluates all components for all starting points. The defaults are
-        smaller than those of sbi, which would take many minutes: ``num_iter`` and
-        ``num_init_samples`` are 100, and ``num_to_optimize`` is 5.
+        The defaults are smaller than those of sbi, which would take many minutes:
+        ``num_iter`` and ``num_init_samples`` are 100, and ``num_to_optimize`` is 5.
         """
         own: dict[str, Any] = dict(
             num_iter=100, num_init_samples=100, num_to_optimize=5
@@ -419,11 +404,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         r"""Return the mass of the density inside the prior's support, ``(B,)``.
 
         It is estimated from 1024 draws with a seed of their own, so that ``log_prob``
-        always returns the same numbers. It is kept until other observations are asked
-        for.
-
-        Args:
-            x: Observations, shape ``(B, *event)``.
+        of observations ``(B, *event)`` always returns the same numbers.
 
         Raises:
             SamplingError: If one of the masses is zero.
@@ -517,9 +498,8 @@ class _Rejection:
 class PriorPosterior(MixturePosterior):
     r"""The prior :math:`p(\theta)`, in the form of an sbi posterior that ignores x.
 
-    It is calibrated whenever the prior is right. An estimate that has learnt something
-    from x has a higher log posterior probability. ``sample`` and ``log_prob`` need no
-    observation, and the batched methods take observations of any shape.
+    ``sample`` and ``log_prob`` need no observation, and the batched methods take
+    observations of any shape.
 
     References:
         | Addressing Misspecification in Simulation-based Inference through Data-driven

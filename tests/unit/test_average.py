@@ -90,7 +90,7 @@ def test_what_cannot_be_averaged_is_refused() -> None:
         ([], None, "at least one"),
         ([member], [0.5, 0.5], "`weights`"),
         ([member, problems.gaussian_posterior()], None, "same `x_o`"),
-        ([member, problems.gaussian_posterior(dim=3)], None, "as the first"),
+        ([member, problems.gaussian_posterior(dim=3)], None, "same shapes"),
     ):
         with pytest.raises(InvalidInputError, match=match):
             average(members, weights=weights)
