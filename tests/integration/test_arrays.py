@@ -75,20 +75,6 @@ def test_a_stack_and_its_diagnosis_take_arrays() -> None:
     )
 
 
-def test_stored_simulations_and_trainers_take_arrays() -> None:
-    theta = problems.box(2).sample((1000,))
-    x = problems.simulate(theta)
-    npe = problems.npe_posterior("mdn")
-    theta_s, x_s = RoPE(npe, simulations=(array(theta), array(x))).source.from_prior(
-        2000
-    )
-    assert torch.equal(theta_s.sort(dim=0).values, theta.sort(dim=0).values)
-    assert torch.equal(x_s.sort(dim=0).values, x.sort(dim=0).values)
-    method = FinetunedNPE.from_posterior(npe, training=Training(max_num_epochs=1))
-    method.append_calibration(*map(array, PAIRS)).train(seed=0, **QUIET)
-    assert method.build_posterior().sample((2,), x=PAIRS[1][0], **QUIET).shape == (2, 2)
-
-
 @pytest.mark.medium
 def test_a_table_is_put_in_the_order_of_the_first_one() -> None:
     def table(numbers: Tensor, names: str) -> Any:

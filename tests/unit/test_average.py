@@ -2,7 +2,6 @@
 
 import copy
 
-import pandas as pd
 import pytest
 import torch
 from sbi.inference import EnsemblePosterior
@@ -112,18 +111,3 @@ def test_posteriors_with_other_priors_are_not_averaged() -> None:
     for members in ([narrow, wide], [wide, narrow]):
         with pytest.raises(InvalidInputError, match=r"posteriors\[1\]"):
             average(members)
-
-
-def test_an_average_knows_the_names_that_its_members_know() -> None:
-    first, second = single(problems.box(2)), single(problems.box(2))
-    first.x_names = second.x_names = ("u", "v", "w")
-    first.parameter_names = second.parameter_names = ("a", "b")
-    posterior = average([first, second])
-    table = pd.DataFrame([[0.0, 1.0, 2.0]], columns=["v", "u", "w"])
-    theta, x = torch.zeros(1, 2), torch.tensor([[1.0, 0.0, 2.0]])
-    found = posterior.log_prob(theta, x=table)
-    assert torch.equal(found, posterior.log_prob(theta, x=x))
-    assert not torch.equal(found, posterior.log_prob(theta, x=x[:, [1, 0, 2]]))
-    assert posterior.parameter_names == ("a", "b")
-    second.parameter_names = ("b", "a")
-    assert average([first, second]).parameter_names is None
