@@ -126,6 +126,10 @@ class RoPE:
         parameter_names: One name for each parameter. If None, the columns of the first
             table of parameters, or "theta_1" and so on.
 
+    Attributes:
+        pairs: The calibration pairs appended so far, with draws of their parameters.
+        source: Where simulations come from.
+
     Raises:
         UnsupportedPosteriorError: If the posterior has no embedding to work with, or
             one that embeds a row of a batch differently among other rows.
@@ -174,7 +178,7 @@ class RoPE:
             simulations = (as_numbers("theta", theta, names=parameter_names), x)
         self._npe = TrainedNPE(posterior, parameter_names)
         self._npe.x_names = x_names
-        self._source: Source = source_of(
+        self.source: Source = source_of(
             self._npe.prior,
             simulator=simulator,
             simulations=simulations,
@@ -184,7 +188,7 @@ class RoPE:
             readable=self._npe.readable,
         )
         x = self._npe.like.new_empty(0, *self._npe.event_shape)
-        self._pairs = Pairs.exact(self._npe.like, x)
+        self.pairs = Pairs.exact(self._npe.like, x)
         self._names: tuple[Hashable, ...] = ()
         self._g: nn.Module | None = None
         self._prior_is_compared = False
@@ -267,20 +271,20 @@ class RoPE:
             )
             label, weight, x = label[known], weight[known], x[known]
             of_rows = tuple(itertools.compress(of_rows, known.tolist()))
-        if len(self._pairs) and bool(self._names) != bool(of_rows):
+        if len(self.pairs) and bool(self._names) != bool(of_rows):
             raise InvalidInputError(
                 "Expected `groups` of all calibration pairs, or of none; got some."
             )
-        label, of_rows = self._pairs.label + label, self._names + of_rows
+        label, of_rows = self.pairs.label + label, self._names + of_rows
         group = label.group
         if of_rows:
             numbers = {name: k for k, name in enumerate(dict.fromkeys(of_rows))}
             group = torch.tensor([numbers[name] for name in of_rows]).to(group)
         pairs = Pairs(
             theta=draws_of(label, self._npe.prior),
-            x=torch.cat([self._pairs.x, x]),
+            x=torch.cat([self.pairs.x, x]),
             group=group,
-            weight=torch.cat([self._pairs.weight, weight]),
+            weight=torch.cat([self.pairs.weight, weight]),
             label=label,
         )
         total = float(pairs.weight.sum())
@@ -294,7 +298,7 @@ class RoPE:
                 f"{', '.join(found)} lie exactly on the prior's bound; if they are "
                 "censored, pass theta_std."
             )
-        self._pairs, self._names = pairs, of_rows
+        self.pairs, self._names = pairs, of_rows
         self._npe.parameter_names, self._npe.x_names = names, x_names
         self._g, self._history = None, None
         self._prior_is_compared = False
@@ -318,11 +322,11 @@ class RoPE:
         Returns:
             Itself, so that calls can be chained.
         """
-        if not len(self._pairs):
+        if not len(self.pairs):
             raise NotReadyError(
                 "No calibration pairs; call `append_calibration(theta, x)` first."
             )
-        show, pairs = is_shown(show_progress_bars), self._pairs
+        show, pairs = is_shown(show_progress_bars), self.pairs
 
         def drawn(count: int) -> Tensor:
             if pairs.are_exact:
@@ -331,7 +335,7 @@ class RoPE:
             return tuning_targets(
                 embed(self._npe.h, pairs.x),
                 moments(
-                    self._source,
+                    self.source,
                     pairs,
                     self.finetuner.simulations_per_target,
                     self._embed_simulations,
@@ -368,8 +372,8 @@ class RoPE:
             :math:`E[h(S(\theta)) \mid y_i]`, shape ``(n_c, l)``.
         """
         return targets(
-            self._source,
-            self._pairs,
+            self.source,
+            self.pairs,
             simulations_per_target,
             self._embed_simulations,
             num_neighbors=self.finetuner.num_neighbors,
@@ -378,7 +382,7 @@ class RoPE:
 
     def _simulations(self, count: int, *, progress: bool) -> Tensor:
         """Return up to ``count`` simulations from the prior, always the same."""
-        return self._source.from_prior(count, seed=0, progress=progress)[1]
+        return self.source.from_prior(count, seed=0, progress=progress)[1]
 
     def embed(
         self,
@@ -393,9 +397,9 @@ class RoPE:
         The arguments are those of :meth:`build_posterior`, which with the same
         ``num_simulations`` and ``seed`` couples with the same simulations.
         """
-        if len(self._pairs) and self._g is None:
+        if len(self.pairs) and self._g is None:
             raise NotReadyError(
-                f"{len(self._pairs)} calibration pairs were appended; call `train()` "
+                f"{len(self.pairs)} calibration pairs were appended; call `train()` "
                 "first."
             )
         net = self._npe.h if self._g is None else self._g
@@ -403,7 +407,7 @@ class RoPE:
         real = self._npe.embed("x_o", x_o, net)
         check("num_simulations", num_simulations, Count | None)
         with seeded(seed):
-            theta, simulated = self._source.from_prior(
+            theta, simulated = self.source.from_prior(
                 num_simulations or max(len(x_o), MIN_SIMULATIONS),
                 self._embed_simulations,
                 progress=is_shown(show_progress_bars),
@@ -467,10 +471,10 @@ class RoPE:
 
     def _warn_of_prior(self, tau: float) -> None:
         """Warn once if a batch is spread over a prior that the labels do not follow."""
-        if self._prior_is_compared or tau < 1 or not len(self._pairs):
+        if self._prior_is_compared or tau < 1 or not len(self.pairs):
             return
         self._prior_is_compared = True
-        found = probability_of_prior(self._pairs, self._npe.prior)
+        found = probability_of_prior(self.pairs, self._npe.prior)
         if is_improbable(found):
             warn_user(
                 "The labels are not distributed like the prior (probability that they "
@@ -490,16 +494,6 @@ class RoPE:
         return self._npe.as_x("x_o", x_o)
 
     @property
-    def pairs(self) -> Pairs:
-        """The calibration pairs appended so far, with draws of their parameters."""
-        return self._pairs
-
-    @property
-    def source(self) -> Source:
-        """Where simulations come from."""
-        return self._source
-
-    @property
     def npe(self) -> Any:
         """A copy of the NPE posterior that this object repairs."""
         return self._npe.posterior()
@@ -507,7 +501,7 @@ class RoPE:
     @property
     def calibration(self) -> tuple[Tensor, Tensor]:
         """The pairs so far, theta (its mean given a label that is not exact) and x."""
-        return self._pairs.mean.clone(), self._pairs.x.clone()
+        return self.pairs.mean.clone(), self.pairs.x.clone()
 
     @property
     def parameter_names(self) -> tuple[str, ...] | None:
@@ -546,7 +540,7 @@ class RoPE:
     @property
     def num_dropped_simulations(self) -> int:
         """Number of simulations dropped so far because of NaN or Inf."""
-        return self._source.num_dropped
+        return self.source.num_dropped
 
     @property
     def num_simulator_calls(self) -> int:
@@ -557,14 +551,14 @@ class RoPE:
         :meth:`build_posterior`, and by :func:`~sbi_rope.stack` 10,000 from the prior
         and 100 for each label.
         """
-        return self._source.num_calls
+        return self.source.num_calls
 
     def __repr__(self) -> str:
         name = type(self._npe.estimator).__name__
         state = "trained" if self.is_trained else "not trained"
         return (
-            f"RoPE({name}, {len(self._pairs)} calibration pairs in "
-            f"{self._pairs.num_groups} groups, {state}, "
+            f"RoPE({name}, {len(self.pairs)} calibration pairs in "
+            f"{self.pairs.num_groups} groups, {state}, "
             f"gamma {self.coupler.gamma:g}, tau {self.coupler.tau:g})"
         )
 

@@ -1,7 +1,4 @@
-"""Sources of simulations, and what simulations at the labels of pairs are like.
-
-A source is a user's simulator, or pairs (theta, x) that were stored.
-"""
+"""Sources of simulations, and what simulations at the labels of pairs are like."""
 
 import itertools
 import warnings
@@ -78,14 +75,10 @@ def parallel(
 ) -> ParallelSimulator:
     """Return a simulator whose rows are simulated in several processes at once.
 
-    Pass what it returns as ``simulator``. Each worker of joblib gets one theta at a
-    time, or a hundred rows if the simulator takes batches. It pays if a call takes
-    longer than about a millisecond.
-
-    Each piece has its own seed, so that simulations are the same for any
-    ``num_workers``, but others than without ``parallel``. Seed a generator of your own
-    inside the simulator from a global one, or all workers may repeat the same noise:
-    ``rng = np.random.default_rng(np.random.randint(2**31))``.
+    It pays if a call takes longer than about a millisecond. Simulations are the same
+    for any ``num_workers``, but others than without ``parallel``. Seed a generator of
+    your own inside the simulator from a global one, or all workers may repeat the same
+    noise: ``rng = np.random.default_rng(np.random.randint(2**31))``.
 
     Args:
         simulator: As RoPE takes it. It may be a lambda.
@@ -160,10 +153,6 @@ class Simulated:
 
     Simulations that are not ``readable`` are dropped, counted and warned of. The others
     have the ``event_shape``, and the dtype and device of ``like``.
-
-    Attributes:
-        num_calls: How many rows were simulated so far.
-        num_dropped: How many simulations were dropped so far.
     """
 
     def __init__(
@@ -229,21 +218,15 @@ class Simulated:
         empty = ~valid.reshape(theta.shape[:2]).any(dim=1)
         if empty.any():
             # Row numbers would mislead, because these may be some of the pairs only.
-            first = theta[empty].mean(dim=1)[:5].tolist()
-            digits = [[float(f"{number:.4g}") for number in row] for row in first]
             raise SimulationError(
-                f"All simulations at the calibration parameters {digits} failed. "
-                "Remove these pairs."
+                "All simulations at the calibration parameters "
+                f"{theta[empty].mean(dim=1)[:5].tolist()} failed. Remove these pairs."
             )
         embedded = embedded.where(valid[:, None], torch.nan)
         return embedded.reshape(*theta.shape[:2], -1)
 
     def _working_way(self, function: Callable[[Any], Any]) -> _Way:
-        """Try batches before single parameters, and tensors before arrays.
-
-        A simulator written for arrays may take tensors and return arrays of float32,
-        and one written for a single theta may add the same noise to all rows.
-        """
+        """Try batches before single parameters, and tensors before arrays."""
         sizes = {*self._prior.event_shape, *self._event_shape}
         # A number of rows that is no number of parameters or of readings.
         num_rows = next(n for n in range(3, 4 + len(sizes)) if n not in sizes)
@@ -261,6 +244,7 @@ class Simulated:
                     x = way.x_of(given)
                     if batched and bool((x == x[0]).all()):
                         self.num_calls += rows
+                        # Written for one theta, it may add one noise to all rows.
                         if not torch.equal(way.simulate(given)[0], x):
                             raise SimulationError("All rows have the same noise.")
                 return way
@@ -429,13 +413,11 @@ class Stored:
 
 
 class Budget(Stored):
-    """Simulations from the prior, made when first needed, then used as stored ones.
-
-    If that is interrupted, the next call goes on where it was.
-    """
+    """Simulations from the prior, made when first needed, then used as stored ones."""
 
     def __init__(self, simulated: Simulated, n: int) -> None:
         self._simulated, self._n, self._pairs = simulated, n, None
+        # If that is interrupted, the next call goes on where it was.
         self._finished: list[Result] = []
 
     @property
@@ -608,14 +590,12 @@ def moments(
     r"""Return the moments of simulations at the parameters of each pair.
 
     At exact parameters these are the moments of ``count`` simulations. Otherwise one
-    simulation is made at each draw that the label leaves possible, and a surface is
-    fitted to the simulations of each label, linear or, with enough draws, quadratic.
-    Its values at the draws are the possible means. The covariance is that of the
-    residuals.
+    simulation is made at each draw of a label, and a surface is fitted to them, linear
+    or, with enough draws, quadratic. Its values at the draws are the possible means.
+    The covariance is that of the residuals.
 
     A surface also fits the noise of the simulations. Its linear and its quadratic terms
-    are shrunk by how much of their size is noise, as James and Stein did, so that
-    labels that are nearly exact have a single possible mean.
+    are shrunk by how much of their size is noise, as James and Stein did.
 
     References:
         | Estimation with Quadratic Loss (James and Stein, 1961)

@@ -44,7 +44,7 @@ def as_batch(
         sizes = ", ".join(map(str, ("n" if rows is None else rows, *event)))
         raise InvalidInputError(
             f"Expected `{name}` of shape ({sizes}{'' if event else ','}); got {shape}."
-            + _hint(name, shape, event)
+            + (f" For a single row pass `{name}[None]`." if shape == event else "")
         )
     if not (empty or shape[0]) or 0 in shape[1:]:
         raise InvalidInputError(
@@ -128,12 +128,3 @@ def rows_with(bad: Tensor) -> str:
     rows = bad.flatten(1).any(dim=1) if bad.ndim > 1 else bad.reshape(-1)
     first = rows.nonzero().flatten()[:5].tolist()
     return f"{int(rows.sum())} of {rows.numel()} rows (first: {first})"
-
-
-def _hint(name: str, shape: tuple[int, ...], event: tuple[int, ...]) -> str:
-    """Say which call makes the batch fit; nothing if that is not known."""
-    if shape == event:
-        return f" For a single row pass `{name}[None]`."
-    if len(shape) == 1 and event == (1,):
-        return f" For one number in each row pass `{name}[:, None]`."
-    return ""

@@ -154,10 +154,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         return True  # also an amortised one, which has no length
 
     def __getitem__(self, index: int) -> "MixturePosterior":
-        """Return the posterior of one observation, which is its default x.
-
-        It does not know the other observations of the batch.
-        """
+        """Return the posterior of one observation alone, which is its default x."""
         index = range(len(self))[operator.index(index)]
         density = self.posterior_estimator.restricted_to(index)
         view = copy.copy(self)
@@ -269,8 +266,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         Args:
             sample_shape: Shape of the draws of each observation.
             x: Observations, shape ``(B, *event)``.
-            max_sampling_batch_size: The largest number of draws the flow makes at a
-                time. If None, the number that is fast on the device.
+            max_sampling_batch_size: The most draws that are made at a time.
             show_progress_bars: Whether to show how many draws were accepted so far.
                 None does so in a terminal or a notebook, but not in a file.
             reject_outside_prior: Whether to draw from the density truncated to the
@@ -448,8 +444,7 @@ class _Rejection:
         still_open = torch.ones_like(row, dtype=torch.bool)
         rate = 1.0
         while (open_slots := still_open.nonzero().flatten()).numel():
-            # At this rate most slots are filled. For the last few slots, more proposals
-            # take no longer than one.
+            # For the last few slots, more proposals take no longer than one.
             count = len(open_slots)
             wanted = max(int(1 / max(rate, MIN_ACCEPTANCE)), SMALL_BATCH // count)
             repeats = max(1, min(wanted, num_fitting(count)))

@@ -92,20 +92,6 @@ def test_sampling_gives_up_after_the_time_that_it_is_given() -> None:
             sample((3,), x, max_sampling_time=-1.0, **QUIET)
 
 
-def test_set_default_x_serves_all_methods_and_can_be_chained() -> None:
-    posterior = gaussian_posterior()
-    x, theta = posterior.x_o[3], torch.zeros(2, 2)
-    expected = posterior.log_prob(theta, x=x)
-    assert posterior.set_default_x(x) is posterior
-    assert torch.equal(posterior.log_prob(theta), expected)
-    torch.manual_seed(1)
-    samples = posterior.sample((4,), **QUIET)
-    torch.manual_seed(1)
-    assert torch.equal(posterior.sample((4,), x=x, **QUIET), samples)
-    posterior.set_default_x(posterior.x_o[0])
-    assert not torch.equal(posterior.log_prob(theta), expected)
-
-
 def test_the_potential_is_the_log_prob_without_normalisation() -> None:
     posterior = gaussian_posterior()
     theta = 3 * torch.rand(9, 2) - 1.5

@@ -2,10 +2,9 @@
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from sbi_rope import RoPE, diagnose
-from sbi_rope._sbi import embedding_of, posterior_from, with_embedding
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import (
     InvalidInputError,
@@ -14,15 +13,12 @@ from sbi_rope.errors import (
 )
 from sbi_rope.metrics import draw_samples, evaluate
 from sbi_rope.stacking import (
-    DiscrepancyCandidate,
-    FinetunedCandidate,
-    StackData,
     default_candidates,
 )
 from sbi_rope.trainers import FinetunedNPE
 from sbi_rope.trainers.training import Training
 from tests import problems
-from tests.stacks import QUICK, QUIET, rope_of, stacked
+from tests.stacks import QUICK, QUIET, stacked
 
 
 def labelled(n: int) -> tuple[Tensor, Tensor]:
@@ -135,32 +131,3 @@ def test_a_net_that_counts_the_trials_of_another_row_is_refused() -> None:
         match = "embedding of a row alone than in a batch"
         with pytest.raises(UnsupportedPosteriorError, match=match):
             call()
-
-
-def test_missing_numbers_of_a_vector_are_embedded_but_not_corrected() -> None:
-    npe = problems.npe_posterior()
-    net = nn.Sequential(problems.Filled(), *embedding_of(npe.posterior_estimator))
-    estimator = with_embedding(npe.posterior_estimator, net)
-    rope = RoPE(posterior_from(npe, estimator), simulator=problems.simulate)
-    theta = problems.box(2).sample((12,))
-    x = problems.simulate(theta)
-    x[0, 1] = torch.nan
-    rope.append_calibration(theta, x)
-    data = StackData(rope, num_folds=2, seed=0, **QUIET)
-    assert torch.isfinite(data.embedded).all()
-    untrained = RoPE(posterior_from(npe, estimator), simulator=problems.simulate)
-    assert torch.isfinite(untrained.embed(x).real).all()
-    for space, applies in (("embedding", True), ("input", False)):
-        assert DiscrepancyCandidate(space=space).suits(data) is applies
-        assert not FinetunedCandidate(space=space).suits(data)  # of two folds
-    # What is fine-tuned is corrected in x if that can be, and else in the embedding.
-    complete = rope_of()
-    for one, in_x in ((rope, False), (complete, True)):
-        three = StackData(one, num_folds=3, seed=0, **QUIET)
-        assert FinetunedCandidate(space="input").suits(three) is in_x
-        assert FinetunedCandidate(space="embedding").suits(three) is not in_x
-    method = DiscrepancyNPE.from_posterior(
-        posterior_from(npe, estimator), simulator=problems.simulate, space="input"
-    )
-    with pytest.raises(InvalidInputError, match="`x` to be finite"):
-        method.append_calibration(theta, x).train(**QUIET)

@@ -11,7 +11,6 @@ import torch
 from sbi.diagnostics import (
     check_sbc,
     check_tarp,
-    get_nltp,
     run_sbc,
     run_tarp,
 )
@@ -141,16 +140,6 @@ def test_tarp_accepts_calibrated_posteriors(
     area, p_value = check_tarp(ecp, alpha)
     assert abs(area) < 2
     assert p_value > 0.05
-
-
-def test_nltp_is_the_normalised_negative_log_prob(
-    posterior: MixturePosterior, theta: Tensor
-) -> None:
-    with warnings.catch_warnings():
-        warnings.filterwarnings("error", message=".*not normalized.*")
-        nltp = get_nltp(theta, posterior.x_o, posterior)
-    expected = -posterior.log_prob_batched(theta, posterior.x_o)[0]
-    assert torch.allclose(nltp, expected, atol=1e-5)
 
 
 @pytest.mark.medium

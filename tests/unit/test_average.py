@@ -69,17 +69,6 @@ def test_the_members_of_an_ensemble_are_repaired_one_by_one() -> None:
     assert float(share) == pytest.approx(float(alone @ WEIGHTS), abs=0.05)
 
 
-def test_an_average_is_a_copy_and_has_equal_weights_by_default() -> None:
-    member = problems.gaussian_posterior()
-    posterior = average([member, member])
-    assert posterior.posterior_estimator.weights.tolist() == [0.5, 0.5]
-    part = posterior.posterior_estimator.parts[0]
-    assert part is not member.posterior_estimator
-    # The members of an average may be averages.
-    nested = average([posterior, member], weights=[0.2, 0.8])
-    assert nested.posterior_estimator.weights.tolist() == pytest.approx([0.1, 0.1, 0.8])
-
-
 def test_what_cannot_be_averaged_is_refused() -> None:
     member = problems.gaussian_posterior()
     field = problems.vector_field_posterior("fmpe")

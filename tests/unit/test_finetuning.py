@@ -74,22 +74,6 @@ def test_the_net_that_is_kept_is_the_best_on_the_held_out_pairs() -> None:
     assert validation[-1] > validation[best]
 
 
-@pytest.mark.medium
-def test_of_several_learning_rates_the_best_on_the_hold_out_is_kept() -> None:
-    x = torch.randn(30, 2)
-    losses = {}
-    for rate in (1e-5, 1e-2, (1e-5, 1e-2), (1e-2, 1e-5)):
-        finetuner = CalibrationFinetuner(learning_rate=rate, max_num_epochs=300)
-        result = finetuner.finetune(
-            linear(), x, lambda count: 2 * x + 1, seed=0, show_progress_bars=False
-        )
-        losses[rate] = min(result.history.validation_loss)
-        if isinstance(rate, tuple):
-            assert result.history.learning_rate == 1e-2
-    assert losses[1e-2] < losses[1e-5]
-    assert losses[1e-5, 1e-2] == losses[1e-2, 1e-5] == losses[1e-2]
-
-
 def test_the_start_is_kept_if_nothing_is_better() -> None:
     x = torch.randn(10, 2)
     net = linear()

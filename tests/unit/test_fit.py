@@ -11,12 +11,10 @@ from torch import Tensor, nn
 from sbi_rope.ensemble import Ensemble, embedded
 from sbi_rope.errors import RoPEWarning
 from sbi_rope.fit import (
-    EPOCHS_WITHOUT_HOLDOUT,
     Courses,
     History,
     Training,
     fit,
-    fit_on_pairs,
 )
 
 
@@ -68,17 +66,6 @@ def test_the_best_on_the_held_out_data_is_kept_and_not_the_last() -> None:
     assert history.validation_loss[best] == min(history.validation_loss)
     assert module.value.item() == pytest.approx(1.0, abs=0.06)
     assert towards(module, 1.0)().item() == history.kept_validation_loss
-
-
-def test_the_start_competes_and_ties_are_won_by_the_earlier() -> None:
-    def constant() -> Tensor:
-        return torch.ones(())
-
-    for held_out in (0.0, None):
-        module = Number()
-        judged = constant if held_out is None else towards(module, held_out)
-        assert run(module, towards(module, 2.0), judged).best_epoch == 0
-        assert module.value.item() == 0.0
 
 
 def test_it_stops_when_its_patience_is_at_an_end() -> None:
@@ -219,35 +206,3 @@ def test_a_course_that_made_the_loss_worse_is_not_kept() -> None:
 
 
 # --- pairs ---
-
-
-class Constant(nn.Module):
-    """An estimator of sbi whose loss is the distance of theta from a number."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.value = nn.Parameter(torch.zeros(1))
-
-    def loss(self, theta: Tensor, condition: Tensor) -> Tensor:
-        return (theta - self.value).square()[:, 0]
-
-
-def on_pairs(n: int, held_out: int, **options: Any) -> History:
-    theta, rows = torch.ones(n, 1), torch.arange(n)
-    return fit_on_pairs(
-        Constant(),
-        theta,
-        theta,
-        (rows[held_out:], rows[:held_out]),
-        training=Training(training_batch_size=8, **options),
-        in_training_mode=True,
-        label="Pairs",
-        show_progress_bars=False,
-    )
-
-
-def test_without_a_hold_out_it_stops_early_and_warns() -> None:
-    with pytest.warns(RoPEWarning, match="Only 1 different parameters"):
-        assert on_pairs(4, 0).best_epoch == EPOCHS_WITHOUT_HOLDOUT
-    with pytest.warns(RoPEWarning):
-        assert on_pairs(2, 0, max_num_epochs=3).best_epoch == 3

@@ -371,16 +371,6 @@ def test_groups_are_numbers_or_names_of_all_pairs() -> None:
     assert len(named.pairs) == 8
 
 
-def test_weights_that_were_normalised_are_warned_of() -> None:
-    theta, x = gaussian.labelled(12)
-    with pytest.warns(RoPEWarning, match="12 pairs sum to 1, .* do not normalise"):
-        conductor = rope().append_calibration(theta, x, weights=torch.ones(12) / 12)
-    assert "and counted as 1" in str(conductor.pairs)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", RoPEWarning)
-        rope().append_calibration(theta, x, weights=torch.linspace(0.5, 1.5, 12))
-
-
 def test_several_labels_exactly_on_a_bound_of_the_prior_are_named() -> None:
     npe = DirectPosterior(gaussian.GaussianEstimator(), box(2))
 

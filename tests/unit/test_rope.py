@@ -2,7 +2,6 @@
 
 import copy
 import warnings
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -14,7 +13,6 @@ from sbi_rope import (
     CalibrationFinetuner,
     RoPE,
     SinkhornCoupler,
-    stack,
 )
 from sbi_rope.errors import (
     CouplingError,
@@ -24,9 +22,7 @@ from sbi_rope.errors import (
     UnsupportedPosteriorError,
 )
 from sbi_rope.simulate import Stored
-from sbi_rope.stacking import default_candidates
 from tests import gaussian, problems
-from tests.stacks import quick
 
 QUICK = CalibrationFinetuner(max_num_epochs=20)
 
@@ -114,19 +110,6 @@ def test_the_users_posterior_and_data_are_left_as_they_were() -> None:
     assert torch.equal(mine.x_o, X_O)
 
 
-def test_rehearsal_keeps_the_embeddings_of_simulations_in_place() -> None:
-    theta = gaussian.prior().sample((500,))
-    x = gaussian.simulator(theta)
-    stored = {"simulator": None, "simulations": (theta[:50], x[:50])}
-    for source in ({}, stored):
-        moved = []
-        for rehearsal in (0.0, 5.0):
-            conductor = trained(finetuner=replace(QUICK, rehearsal=rehearsal), **source)
-            change = conductor.tuned_embedding_net(x) - conductor.embedding_net(x)
-            moved.append(float(change.norm(dim=1).mean()))
-        assert moved[1] < 0.5 * moved[0]
-
-
 def test_seeds_make_results_repeatable_and_leave_the_callers_state() -> None:
     npe, pairs = gaussian.posterior(), gaussian.labelled(20)
     state = torch.get_rng_state()
@@ -211,19 +194,11 @@ class Centred(nn.Module):
         return x - x.mean(dim=0)
 
 
-class Noisy(nn.Module):
-    """Adds noise of its own to every embedding."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        return x + torch.randn_like(x)
-
-
 def test_a_net_whose_embedding_depends_on_other_rows_is_refused() -> None:
     posterior = gaussian.posterior()
     estimator: Any = posterior.posterior_estimator
-    for extra in (Noisy(), nn.BatchNorm1d(2), nn.LayerNorm(2)):
-        estimator.net = nn.Sequential(nn.Linear(2, 2), extra)
-        RoPE(posterior, simulator=gaussian.simulator)
+    estimator.net = nn.Sequential(nn.Linear(2, 2), nn.BatchNorm1d(2))
+    RoPE(posterior, simulator=gaussian.simulator)
     estimator.net = nn.Sequential(nn.Linear(2, 2), Centred())
     with pytest.raises(UnsupportedPosteriorError, match="reads each observation by"):
         RoPE(posterior, simulator=gaussian.simulator)
@@ -252,13 +227,3 @@ def test_labels_that_do_not_follow_the_prior_are_warned_of_once_with_tau_1() -> 
                 rope.build_posterior(X_O, coupler=SinkhornCoupler(gamma=0.5, tau=tau))
             found.append(any("distributed like the" in str(w.message) for w in caught))
         assert found == [False, scale < 1, False]
-
-
-def test_training_and_the_mode_work_where_gradients_are_off() -> None:
-    with torch.no_grad(), quick():
-        conductor = trained()
-        posterior = conductor.build_posterior(X_O, num_simulations=60, seed=0)
-        mode = posterior[0].map(num_iter=5, num_to_optimize=2, num_init_samples=10)
-        stacked = stack(conductor, candidates=default_candidates()[:3], num_folds=2)
-    assert torch.isfinite(mode).all()
-    assert len(stacked.candidate_weights) == 3

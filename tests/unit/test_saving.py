@@ -15,9 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from sbi.utils import BoxUniform, MultipleIndependent
 from torch import Tensor, nn
-from torch.distributions import Exponential, Gamma, Independent, LogNormal
 
 from sbi_rope import MixturePosterior, StackedPosterior, load, save
 from sbi_rope.density import Flow, Mixture, PriorPosterior
@@ -146,11 +144,6 @@ def test_posteriors_of_vector_fields_can_be_saved(method: str, tmp_path: Path) -
 @pytest.mark.parametrize(
     "prior",
     [
-        BoxUniform(-torch.ones(2), torch.ones(2)),
-        Independent(LogNormal(torch.zeros(2), torch.ones(2)), 1),
-        MultipleIndependent(
-            [Gamma(torch.ones(1), torch.ones(1)), Exponential(torch.ones(1))]
-        ),
         UniformTriangle(torch.tensor(0.5)),
         PopulationPrior(),
     ],
