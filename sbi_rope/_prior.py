@@ -87,10 +87,7 @@ class PriorDistribution(Distribution):
         return torch.isfinite(self.log_prob(theta))
 
     def moved_inside(self, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """Return parameters ``(n, d)``, those outside replaced, and which were inside.
-
-        Outside, networks may return anything, gradients of NaN included.
-        """
+        """Return theta ``(n, d)``, rows outside replaced, and which were inside."""
         inside = self.inside(theta)
         return theta.where(inside[:, None], self._some.to(theta)), inside
 
@@ -120,10 +117,7 @@ class PriorDistribution(Distribution):
             return None
 
     def bounds(self, like: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the ends of the support, infinite where they are not known.
-
-        They get the shape ``(*batch, d)``, dtype and device of ``like``.
-        """
+        """Return the ends of the support, like ``like``; infinite where not known."""
         return _bounds(self._support, like)
 
     def off_bounds(self, theta: Tensor) -> Tensor:

@@ -91,10 +91,7 @@ def embedding_of(estimator: ConditionalEstimator) -> nn.Module:
 
 
 def headless(estimator: ConditionalEstimator) -> Any:
-    r"""Return :math:`q(\theta \mid h)`: the estimator without its embedding.
-
-    The parameters are shared with ``estimator``, which is left as it was.
-    """
+    r"""Return :math:`q(\theta \mid h)`, which shares the parameters of an estimator."""
     embedding = embedding_of(estimator)
     blank = parameter_of(estimator).new_zeros(1, *estimator.condition_shape)
     embedded_shape = embed(embedding, blank).shape[1:]
@@ -132,10 +129,7 @@ def with_embedding(
 
 
 def embed(net: nn.Module, x: Tensor, *, batch_size: int = 1000) -> Tensor:
-    """Apply an embedding net without gradients, in batches: ``(n, *)`` to ``(n, l)``.
-
-    The net runs in evaluation mode, so that a row does not depend on its batch.
-    """
+    """Apply a net in evaluation mode, in batches, without gradients, to ``(n, l)``."""
     modes = {module: module.training for module in net.modules()}
     net.eval()
     try:
@@ -148,10 +142,7 @@ def embed(net: nn.Module, x: Tensor, *, batch_size: int = 1000) -> Tensor:
 
 
 def standardisation_of(embedding_net: nn.Module) -> tuple[Tensor, Tensor] | None:
-    """Return the mean and standard deviation by which sbi standardises x.
-
-    Each has the shape of one observation or none. None if there is no such layer.
-    """
+    """Return mean and standard deviation of sbi's standardising layer, if any."""
     layers = (part for part in embedding_net.modules() if isinstance(part, Standardize))
     layer: Any = next(layers, None)
     return None if layer is None else (layer._mean, layer._std)
@@ -721,10 +712,7 @@ class _NoTracker:
 
 
 def squared_mmd(a: Tensor, b: Tensor) -> float:
-    """Return the squared MMD of two sets, ``(n, l)`` and ``(m, l)``.
-
-    The kernel is Gaussian. Its width is the median distance between the sets.
-    """
+    """Return the squared MMD of two sets, Gaussian, of the median width."""
     # It needs packages that nothing else here needs.
     from sbi.diagnostics.misspecification import compute_rbf_mmd_median_heuristic
 

@@ -326,11 +326,7 @@ def split_pairs(
 
 
 def split_groups(groups: Tensor, num_folds: int) -> list[Tensor]:
-    """Cut rows into folds at random, with the rows of a group in the same fold.
-
-    There are at most as many folds as groups, with equally many rows as far as the
-    groups allow.
-    """
+    """Cut rows into folds of like size at random; a group is in one fold."""
     # scikit-learn's GroupKFold refuses fewer groups than folds, and in which order it
     # takes groups of equal size depends on its version.
     groups = groups_of(groups)
@@ -349,10 +345,7 @@ def split_groups(groups: Tensor, num_folds: int) -> list[Tensor]:
 
 
 def groups_to_hold_out(wanted: int, sizes: list[int]) -> list[int]:
-    """Choose some groups of these sizes, in order, with about as many rows as wanted.
-
-    If all groups are too large, it is the smallest.
-    """
+    """Choose some groups, in order, with some ``wanted`` rows, or the smallest."""
     chosen, total = [], 0
     for index, size in enumerate(sizes):
         if total + size - wanted <= wanted - total:

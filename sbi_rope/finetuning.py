@@ -363,10 +363,7 @@ def finetune_flow(
 def _with_density(
     losses: Callable[[Tensor], Tensor], rows: Sequence[Tensor]
 ) -> list[Tensor]:
-    """Return the rows of each flow whose loss is finite; warn of the others.
-
-    A label on a bound of the prior may have none, which would end the training.
-    """
+    """Return the rows of each flow whose loss is finite; warn of the others."""
     padded = Padded.of(rows, None)
     if not len(padded):
         return list(rows)
@@ -442,10 +439,7 @@ class Padded:
 
 
 def trainable_copy(embedding_net: nn.Module, embeddings: Tensor) -> nn.Module:
-    """Copy a net so that all of it can be trained, in evaluation mode.
-
-    ``embeddings`` is any batch of its outputs, shape ``(n, l)``.
-    """
+    """Copy a net so that all of it can be trained; without parameters, add a layer."""
     net = copy.deepcopy(embedding_net).requires_grad_()
     if not has_parameters(net):
         width = embeddings.shape[1]

@@ -370,10 +370,7 @@ class _Adam:
 
 @contextmanager
 def differentiable(module: nn.Module) -> Iterator[None]:
-    """Compute the gradients of a module, also where the caller has switched them off.
-
-    Recurrent nets in evaluation mode have them without cuDNN only.
-    """
+    """Compute the gradients of a module, also where the caller switched them off."""
     is_recurrent = any(isinstance(part, nn.RNNBase) for part in module.modules())
     is_slow = is_recurrent and not module.training
     context = torch.backends.cudnn.flags(enabled=False) if is_slow else nullcontext()

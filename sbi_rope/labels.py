@@ -58,10 +58,7 @@ def given_labels(
     prior: PriorDistribution,
     names: Sequence[str] | None,
 ) -> Labels:
-    """Return labels from the arguments of :meth:`RoPE.append_calibration`.
-
-    They get the dtype and device of ``like``, a tensor of shape ``(0, d)``.
-    """
+    """Return labels, like ``like``, from the arguments of ``append_calibration``."""
     dim = like.shape[1]
     theta = as_numbers("theta", theta, device=like.device, names=names)
     event_shape = (theta.shape[1], dim) if theta.ndim == 3 else (dim,)
@@ -340,10 +337,7 @@ def place_nodes(
     *,
     num_nodes: int,
 ) -> Nodes:
-    """Draw the nodes of labels that are measurements, equally many of each reference.
-
-    Nodes outside the support of the prior get the weight zero.
-    """
+    """Draw nodes of measurements, weighted zero outside the support of the prior."""
     n, d = labels.y.shape
     of_each = max(1, math.ceil(num_nodes / len(references)))
     total = of_each * len(references)
@@ -386,7 +380,7 @@ def place_nodes(
 def _updated(
     labels: Labels, mean: Tensor, covariance: Tensor, measured: Tensor, free: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the mean and a Cholesky factor of the open parameters given the label."""
+    """Return mean and Cholesky factor of the open parameters given the label."""
     scale = covariance.diagonal(dim1=1, dim2=2).clamp_min(1e-300)
     covariance = covariance + JITTER * torch.diag_embed(scale)
     noise = labels.covariance[:, measured][:, :, measured]

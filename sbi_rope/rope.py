@@ -68,10 +68,7 @@ class EmbeddedBatch:
     def posterior(
         self, coupling: Coupling, *, unseen: Literal["raise", "extend"] = "raise"
     ) -> MixturePosterior:
-        """Return the mixture of simulated posteriors that a coupling gives.
-
-        ``unseen`` is that of :meth:`~sbi_rope.RoPE.build_posterior`.
-        """
+        """Return the mixture of simulated posteriors that a coupling gives."""
         # Copies, so that moving one posterior to a device leaves the others where they
         # are.
         net, npe = copy.deepcopy(self.embedding_net), self.npe

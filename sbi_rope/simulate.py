@@ -643,10 +643,7 @@ def _features(theta: Tensor) -> list[Tensor]:
 
 
 def _regressed(y: Tensor, terms: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the part of y that is linear in some terms, and how many were fitted.
-
-    Shapes ``(n, R, l)`` and ``(n, R, p)`` to ``(n, R, l)`` and ``(n,)``.
-    """
+    """Return the part of y linear in terms, and how many were fitted, ``(n,)``."""
     ridge = RIDGE * terms.shape[1] * torch.eye(terms.shape[2]).to(terms)
     normal = terms.mT @ terms
     used = torch.linalg.solve(normal + ridge, normal).diagonal(dim1=1, dim2=2)

@@ -211,10 +211,7 @@ class Coupled(OverSimulations):
 
 
 def without_tail(weights: Tensor, tail_mass: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Return row, column and log weight of all weights but the smallest of each row.
-
-    These sum to at most ``tail_mass``.
-    """
+    """Return row, column and log weight of all but the smallest weights of a row."""
     # The sum starts at the smallest weights, so that rounding does not lose them.
     ascending, order = weights.sort(dim=1)
     kept = (ascending.cumsum(dim=1, dtype=torch.double) > tail_mass) & (ascending > 0)

@@ -76,10 +76,7 @@ class Flow(Density):
         *,
         nets: Sequence[nn.Module] | None = None,
     ) -> "Flow":
-        """Return the average of copies of estimators of sbi, of one architecture.
-
-        The same one may appear several times. The ``nets`` take the place of their own.
-        """
+        """Return the average of copies of estimators of sbi, or with other ``nets``."""
         first = estimators[0]
         own = {id(one): embedding_of(one) for one in estimators}
         nets = [own[id(one)] for one in estimators] if nets is None else nets
@@ -134,10 +131,7 @@ class Flow(Density):
     def made_of(
         self, members: Sequence[tuple[int, int]], nets: Ensemble | None = None
     ) -> "Flow":
-        """Return the average of copies of some nets and densities, named by numbers.
-
-        The ``nets`` may take the place of those of this flow.
-        """
+        """Return the average of copies of numbered nets (or others) and densities."""
         of_nets, of_densities = zip(*members, strict=True)
         own = self.nets if nets is None else nets
         return self._with(own[of_nets], self.densities[of_densities])

@@ -21,10 +21,7 @@ MIN_SIMULATIONS = 20
 
 
 def estimator_builder(density_estimator: Any) -> EstimatorBuilder:
-    """Return a builder of untrained estimators, from a name or from a builder.
-
-    It copies the network that it was given, so that several methods can share one.
-    """
+    """Return a builder of untrained estimators, with copies of the given network."""
     check("density_estimator", density_estimator, str | Callable)
     # It holds the name, because sbi's builders cannot be pickled.
     return functools.partial(_build, density_estimator)
