@@ -374,8 +374,8 @@ def estimator_of(posterior: Any) -> ConditionalEstimator:
             "around one observation (TSNPE)."
         )
     if isinstance(posterior, VectorFieldPosterior):
-        return _finite(posterior.vector_field_estimator)
-    estimator = getattr(posterior, "posterior_estimator", None)
+        return posterior.vector_field_estimator
+    estimator: Any = getattr(posterior, "posterior_estimator", None)
     if (
         not isinstance(posterior, DirectPosterior)
         or isinstance(posterior, FilteredDirectPosterior | NPE_A_Posterior)
@@ -385,16 +385,6 @@ def estimator_of(posterior: Any) -> ConditionalEstimator:
             "Expected `posterior` to be what `NPE(...).build_posterior()` returns, or "
             f"the posterior of MNPE, FMPE or NPSE; got {type(posterior).__name__}."
         )
-    return _finite(estimator)
-
-
-def _finite(estimator: Any) -> Any:
-    for name, weights in estimator.named_parameters():
-        if not torch.isfinite(weights).all():
-            raise UnsupportedPosteriorError(
-                f"Expected an NPE with finite weights; got NaN or Inf in `{name}`, so "
-                "that its training has failed."
-            )
     return estimator
 
 

@@ -99,10 +99,11 @@ class Flow(Density):
         """Return the average of flows that come from one NPE, with equal weights."""
         parts = []
         for of_each in zip(*((one.nets, one.densities) for one in flows), strict=True):
-            first = of_each[0]
             # Where all have the same net, or density, the average has one, too.
-            if all(len(one) == 1 and _are_equal(one, first) for one in of_each):
-                parts.append(copy.deepcopy(first))
+            stacks = [list(one.parameters()) for one in of_each]
+            same = all(all(map(torch.equal, stacks[0], other)) for other in stacks)
+            if same and all(len(one) == 1 for one in of_each):
+                parts.append(copy.deepcopy(of_each[0]))
                 continue
             full = [
                 one if len(one) > 1 else one[[0] * flow.num_members]
@@ -237,8 +238,3 @@ class Flow(Density):
     def forward(self, x: Tensor) -> Tensor:
         """Return the embeddings by all nets, side by side, ``(B, E * l)``."""
         return self.embed(x).flatten(1)
-
-
-def _are_equal(one: Ensemble, other: Ensemble) -> bool:
-    pairs = zip(one.parameters(), other.parameters(), strict=True)
-    return one is other or all(torch.equal(*pair) for pair in pairs)

@@ -300,7 +300,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             return torch.cat([density.draw(z, some) for some in parts])
 
         if reject_outside_prior:
-            draw = _Rejection(draw, self.prior.inside, num_rows, density.device)
+            draw = rejecting(draw, self.prior.inside, num_rows)
         theta = torch.empty(total, *density.input_shape, device=density.device)
         show = is_shown(show_progress_bars)
         with (
@@ -424,23 +424,14 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         return mass
 
 
-class _Rejection:
-    """Proposes until a draw is accepted, and counts the proposals of each row."""
+def rejecting(
+    propose: Callable[[Tensor], Tensor], accept: Accept, num_rows: int
+) -> Callable[[Tensor], Tensor]:
+    """Return a function that proposes until a draw of each row is accepted."""
+    proposed, inside = torch.zeros(2, num_rows, dtype=torch.long)
 
-    def __init__(
-        self,
-        propose: Callable[[Tensor], Tensor],
-        accept: Accept,
-        num_rows: int,
-        device: torch.device,
-    ) -> None:
-        self.propose, self.accept, self.num_rows = propose, accept, num_rows
-        self.proposed = torch.zeros(num_rows, dtype=torch.long, device=device)
-        self.inside = torch.zeros_like(self.proposed)
-
-    def __call__(self, row: Tensor) -> Tensor:
-        """Draw for each of n numbers of rows until a draw is accepted, ``(n, d)``."""
-        theta: Tensor | None = None
+    def draw(row: Tensor) -> Tensor:
+        theta = torch.empty(0)
         still_open = torch.ones_like(row, dtype=torch.bool)
         rate = 1.0
         while (open_slots := still_open.nonzero().flatten()).numel():
@@ -450,9 +441,9 @@ class _Rejection:
             repeats = max(1, min(wanted, num_fitting(count)))
             proposals = open_slots.repeat_interleave(repeats)
             rows = row[proposals]
-            draws = self.propose(rows)
-            accepted = self.accept(draws)
-            if theta is None:
+            draws = propose(rows)
+            accepted = accept(draws)
+            if not len(theta):
                 theta = draws.new_empty(len(row), *draws.shape[1:])
             # Of several proposals for a slot the first accepted one is kept.
             chosen = accepted.nonzero().flatten()
@@ -461,33 +452,33 @@ class _Rejection:
             first[:1] = True
             theta[filled[first]] = draws[chosen[first]]
             still_open[filled] = False
-            self.count(rows, accepted, row[still_open])
+            proposed.add_(rows.bincount(minlength=num_rows).cpu())
+            inside.add_(rows[accepted].bincount(minlength=num_rows).cpu())
+            missing = row[still_open].bincount(minlength=num_rows).cpu()
+            _give_up_on_hopeless(proposed, inside, missing)
             rate = float(accepted.double().mean())
-        assert theta is not None
         return theta
 
-    def count(self, rows: Tensor, accepted: Tensor, missing: Tensor) -> None:
-        """Count proposals, and give up on rows that would take too many more."""
-        self.proposed += rows.bincount(minlength=self.num_rows)
-        self.inside += rows[accepted].bincount(minlength=self.num_rows)
-        num_missing = missing.bincount(minlength=self.num_rows)
-        share = self.inside / self.proposed.clamp_min(1)
-        slow = (num_missing > 0) & (self.proposed >= MIN_PROPOSALS)
-        slow &= share < MIN_ACCEPTANCE
-        # Infinite if nothing was accepted so far.
-        further = (num_missing[slow] / share[slow]).sum()
-        hopeless = slow & (further > MAX_PROPOSALS)
-        without_any = (self.proposed >= MIN_WITHOUT_ANY) & (self.inside == 0)
-        if int(self.proposed[without_any].sum()) >= MIN_PROPOSALS:
-            hopeless |= without_any
-        if hopeless.any():
-            numbers = hopeless.nonzero().flatten()[:5].tolist()
-            raise SamplingError(
-                f"Less than one in {int(1 / MIN_ACCEPTANCE)} draws lies inside the "
-                f"support of the prior for rows {numbers} of `x`. Leave these "
-                "observations out, train NPE longer, or pass "
-                "reject_outside_prior=False."
-            )
+    return draw
+
+
+def _give_up_on_hopeless(proposed: Tensor, inside: Tensor, missing: Tensor) -> None:
+    """Raise if some rows would take too many more proposals."""
+    share = inside / proposed.clamp_min(1)
+    slow = (missing > 0) & (proposed >= MIN_PROPOSALS) & (share < MIN_ACCEPTANCE)
+    # Infinite if nothing was accepted so far.
+    further = (missing[slow] / share[slow]).sum()
+    hopeless = slow & (further > MAX_PROPOSALS)
+    without_any = (proposed >= MIN_WITHOUT_ANY) & (inside == 0)
+    if int(proposed[without_any].sum()) >= MIN_PROPOSALS:
+        hopeless |= without_any
+    if hopeless.any():
+        numbers = hopeless.nonzero().flatten()[:5].tolist()
+        raise SamplingError(
+            f"Less than one in {int(1 / MIN_ACCEPTANCE)} draws lies inside the support "
+            f"of the prior for rows {numbers} of `x`. Leave these observations out, "
+            "train NPE longer, or pass reject_outside_prior=False."
+        )
 
 
 class PriorPosterior(MixturePosterior):

@@ -371,6 +371,11 @@ def test_groups_are_numbers_or_names_of_all_pairs() -> None:
     assert len(named.pairs) == 8
 
 
+def test_weights_that_were_normalised_are_warned_of() -> None:
+    with pytest.warns(RoPEWarning, match="12 pairs sum to 1, .* do not normalise"):
+        rope().append_calibration(*gaussian.labelled(12), weights=torch.ones(12) / 12)
+
+
 def test_several_labels_exactly_on_a_bound_of_the_prior_are_named() -> None:
     npe = DirectPosterior(gaussian.GaussianEstimator(), box(2))
 

@@ -1,7 +1,6 @@
 """What the package takes from sbi's estimators, and what it refuses."""
 
 import copy
-import re
 from typing import Any
 
 import pytest
@@ -29,7 +28,6 @@ from sbi_rope._sbi import (
     with_embedding,
 )
 from sbi_rope.errors import UnsupportedPosteriorError
-from sbi_rope.trainers import FinetunedNPE
 from tests import problems
 
 
@@ -84,19 +82,6 @@ def test_npe_without_a_prior_is_asked_for_it() -> None:
     with pytest.raises(UnsupportedPosteriorError, match=r"build_posterior\(prior="):
         RoPE(npe.build_posterior(), simulator=problems.simulate)
     RoPE(npe.build_posterior(prior=problems.box(2)), simulator=problems.simulate)
-
-
-def test_networks_whose_training_has_failed_are_refused() -> None:
-    posterior = copy.deepcopy(problems.npe_posterior())
-    [*_, (name, last)] = posterior.posterior_estimator.named_parameters()
-    last.data.flatten()[0] = torch.nan
-    match = f"NaN or Inf in `{re.escape(name)}`"
-    for wrap in (
-        lambda: RoPE(posterior, simulator=problems.simulate),
-        lambda: FinetunedNPE.from_posterior(posterior),
-    ):
-        with pytest.raises(UnsupportedPosteriorError, match=match):
-            wrap()
 
 
 def test_with_embedding_shares_all_other_parameters() -> None:
