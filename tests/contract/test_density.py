@@ -112,8 +112,6 @@ CASES: dict[str, Callable[[], Density]] = {
     "mixture of mixtures": lambda: Mixture([mixture(), several("maf")], [0.5, 0.5]),
 }
 every_kind = pytest.mark.parametrize("make", CASES.values(), ids=CASES)
-A_FEW = ["prior", "one mdn", "several nsf", "nets of maf", "coupled", "mixture"]
-a_few = pytest.mark.parametrize("make", [CASES[name] for name in A_FEW], ids=A_FEW)
 
 
 def posterior_of(density: Density) -> MixturePosterior:
@@ -217,27 +215,6 @@ def test_it_moves_to_a_gpu_and_back(make: Callable[[], Density]) -> None:
     posterior.to("cpu")
     again = posterior.log_prob_batched(theta, x, norm_posterior=False)
     assert torch.equal(again, expected)
-
-
-@a_few
-def test_its_mass_is_the_share_of_its_draws_inside_and_keeps_the_random_state(
-    make: Callable[[], Density],
-) -> None:
-    density, x = make(), batch()
-    posterior = posterior_of(density)
-    state = torch.get_rng_state()
-    mass = posterior.leakage_correction(x)
-    assert torch.equal(posterior.leakage_correction(x), mass)
-    assert torch.equal(torch.get_rng_state(), state)
-    draws = density.sample(Size((4000,)), x)
-    share = (draws.abs() <= 1).double().mean(dim=(0, 2))
-    error = problems.error_of_mass(mass, draws=800)  # those of both
-    assert ((mass - share).abs() < 4.5 * error + 1e-3).all()
-    assert (posterior.sample_batched((500,), x, **QUIET).abs() <= 1).all()
-    theta = draws.clamp(-0.99, 0.99)[:5]
-    free = posterior.log_prob_batched(theta, x, norm_posterior=False)
-    found = free - posterior.log_prob_batched(theta, x)
-    assert torch.allclose(found, mass.log().expand(5, -1), atol=1e-5)
 
 
 def test_mixed_parameters_have_a_mass_of_one_over_all_categories() -> None:
@@ -529,17 +506,3 @@ def test_an_observation_at_which_a_density_fails_gives_a_named_error() -> None:
     x[1] = 1e20
     with pytest.raises(SamplingError, match="far from all simulations"):
         Flow.of([estimator]).sample(Size((4,)), x)
-
-
-def test_an_amortised_posterior_has_no_batch() -> None:
-    posterior: Any = posterior_of(several("nsf"))
-    assert posterior.is_amortised
-    assert posterior  # although it has no length
-    for call in (
-        lambda: posterior.x_o,
-        lambda: posterior.weights,
-        lambda: len(posterior),
-        lambda: posterior[0],
-    ):
-        with pytest.raises(InvalidInputError, match="amortised"):
-            call()

@@ -9,16 +9,13 @@ import pytest
 import torch
 from sbi.inference import NPE
 from sbi.neural_nets import posterior_nn
-from sbi.utils import within_support
 from torch import Tensor, nn
 from torch.distributions import Gamma, Independent
 
 from sbi_rope import RoPE
-from sbi_rope._prior import PriorDistribution
 from sbi_rope.baselines import FinetunedNPE
 from sbi_rope.errors import RoPEWarning
 from sbi_rope.finetuning import FINETUNING
-from sbi_rope.labels import given_labels, place_nodes, reference_of
 from sbi_rope.stacking import StackedPosterior, default_candidates, stack
 
 PRIOR = Independent(Gamma(1.5 * torch.ones(2), torch.ones(2)), 1)
@@ -90,22 +87,3 @@ def test_a_label_on_a_bound_does_not_stop_fine_tuning() -> None:
         method.train(show_progress_bars=False)
     tuned = method.build_posterior().posterior_estimator
     assert (start.loss(theta, x) - tuned.loss(theta, x)).mean() > 0.1
-
-
-def test_what_labels_leave_possible_is_inside_the_support() -> None:
-    theta = labels()
-    theta[::3, 0] = torch.nan
-    of_labels = given_labels(
-        theta,
-        theta_std=0.5,
-        theta_cov=None,
-        like=theta[:0],
-        prior=PriorDistribution(PRIOR),
-        names=None,
-    )
-    draws = 0.1 + torch.randn(50, 24, 2)
-    nodes = place_nodes(
-        of_labels, [reference_of(draws)], PriorDistribution(PRIOR), num_nodes=40
-    )
-    assert torch.isneginf(nodes.log_weights).any()
-    assert within_support(PRIOR, nodes.theta.reshape(-1, 2)).all()

@@ -8,7 +8,6 @@ from sbi_rope import RoPE, diagnose
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import (
     InvalidInputError,
-    SimulationError,
     UnsupportedPosteriorError,
 )
 from sbi_rope.metrics import draw_samples, evaluate
@@ -85,21 +84,6 @@ def test_trainers_that_start_from_a_posterior_take_missing_trials() -> None:
     for method in (tuned, corrected):
         method.append_calibration(*labelled(12)).train(seed=0, **QUIET)
         assert is_finite(method.build_posterior(), theta_o, x_o)
-
-
-def test_simulations_all_of_which_are_missing_have_failed() -> None:
-    def fails(theta: Tensor) -> Tensor:
-        x = problems.simulate_trials(theta)
-        return x.where((theta[:, 0] < 0)[:, None, None], torch.nan)
-
-    rope = RoPE(problems.trials_posterior(), simulator=fails)
-    with pytest.warns(match=r"Dropped \d+ of 200 simulations from the prior"):
-        embedded = rope.embed(labelled(20)[1], num_simulations=200, **QUIET)
-    assert (embedded.theta[:, 0] < 0).all()
-    assert rope.num_dropped_simulations == 200 - len(embedded.theta)
-    rope.append_calibration(torch.full((5, 2), 0.5), labelled(5)[1])
-    with pytest.raises(SimulationError, match=r"All \d+ simulations at"):
-        rope.train(**QUIET)
 
 
 def test_what_the_net_cannot_read_is_refused() -> None:

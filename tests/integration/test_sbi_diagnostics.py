@@ -16,7 +16,6 @@ from sbi.diagnostics import (
 )
 from sbi.diagnostics.misspecification import calculate_p_misspecification
 from sbi.diagnostics.sbc import check_uniformity_frequentist
-from sbi.inference import EnsemblePosterior
 from torch import Tensor
 
 from sbi_rope import (
@@ -155,20 +154,3 @@ def test_misspecification_is_noticed_before_tuning_and_much_smaller_after(
     )
     assert before[0] < 0.02
     assert after[1][1] < 0.3 * before[1][1]
-
-
-def test_an_ensemble_of_posteriors_averages_their_densities(
-    posterior: MixturePosterior,
-) -> None:
-    other = problems.gaussian_posterior(n_s=7, x_o=posterior.x_o)
-    ensemble = EnsemblePosterior([posterior, other], weights=[0.25, 0.75])
-    x, theta = posterior.x_o[3], 2 * torch.rand(6, 2) - 1
-    ensemble.set_default_x(x)
-    expected = (
-        0.25 * posterior.log_prob(theta, x=x).exp()
-        + 0.75 * other.log_prob(theta, x=x).exp()
-    )
-    assert torch.allclose(ensemble.log_prob(theta).exp(), expected, atol=1e-5)
-    samples = ensemble.sample((500,), **QUIET)
-    assert samples.shape == (500, 2)
-    assert (samples.abs() <= 1).all()

@@ -299,27 +299,6 @@ def solve(kernel: Any, n_s: int, **options: Any) -> Any:
     return solve_fixed_point(kernel, start, **(settings | options))
 
 
-def plain_iterations(kernel: Any, potential: Tensor, tolerance: float) -> Any:
-    """Iterate without acceleration; return the number of iterations and the result."""
-    for iteration in range(1, 20_000):
-        log_q = kernel(potential)
-        if marginal_error(log_q, potential, 1.0) <= tolerance:
-            return iteration, potential
-        potential = potential - log_q
-        potential = potential - potential.mean()
-    raise AssertionError("not converged")
-
-
-def test_acceleration_needs_fewer_iterations_for_the_same_plan() -> None:
-    real, simulated = clouds(300, 200, 5)
-    kernel = kernel_of("stored", real, simulated, 0.15)
-    accelerated = solve(kernel, 200)
-    count, plain = plain_iterations(kernel, torch.zeros(200).double(), 1e-8)
-    assert accelerated.num_iterations < 0.4 * count
-    assert accelerated.marginal_error <= 1e-8
-    assert (plain - accelerated.potential).abs().max() < 1e-4
-
-
 def unbalanced_clusters() -> tuple[Tensor, Tensor, float]:
     """Clusters with other shares of observations than of simulations.
 
