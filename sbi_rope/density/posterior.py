@@ -290,7 +290,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         num_samples, num_rows = shape.numel(), len(x)
         total, start = num_samples * num_rows, time.monotonic()
 
-        def draw(row: Tensor) -> Tensor:
+        def propose(row: Tensor) -> Tensor:
             if max_sampling_time and time.monotonic() > start + max_sampling_time:
                 raise SamplingError(
                     "Sampling took longer than `max_sampling_time`: not all of "
@@ -299,8 +299,9 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             parts = row.split(max_sampling_batch_size or len(row))
             return torch.cat([density.draw(z, some) for some in parts])
 
+        draw: Callable[[Tensor], Tensor] = propose
         if reject_outside_prior:
-            draw = rejecting(draw, self.prior.inside, num_rows)
+            draw = rejecting(propose, self.prior.inside, num_rows)
         theta = torch.empty(total, *density.input_shape, device=density.device)
         show = is_shown(show_progress_bars)
         with (
