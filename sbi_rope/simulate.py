@@ -218,9 +218,11 @@ class Simulated:
         empty = ~valid.reshape(theta.shape[:2]).any(dim=1)
         if empty.any():
             # Row numbers would mislead, because these may be some of the pairs only.
+            first = theta[empty].mean(dim=1)[:5].tolist()
+            digits = [[float(f"{number:.4g}") for number in row] for row in first]
             raise SimulationError(
-                "All simulations at the calibration parameters "
-                f"{theta[empty].mean(dim=1)[:5].tolist()} failed. Remove these pairs."
+                f"All simulations at the calibration parameters {digits} failed. "
+                "Remove these pairs."
             )
         embedded = embedded.where(valid[:, None], torch.nan)
         return embedded.reshape(*theta.shape[:2], -1)

@@ -244,8 +244,9 @@ class Given(Density):
         expected = ((1, len(x)), (3, *theta.shape))
         if shapes != expected:
             raise InvalidInputError(
-                "Expected log_prob(theta, x) and sample((3,), x) of shapes "
-                f"{expected} for {len(x)} observations; got {shapes}."
+                f"Expected log_prob(theta, x) of shape {expected[0]} and "
+                f"sample((3,), x) of shape {expected[1]} for {len(x)} observations; "
+                f"got {shapes[0]} and {shapes[1]}."
             )
 
     def embed(self, x: Tensor) -> Tensor:
