@@ -145,6 +145,17 @@ def test_rows_of_the_batch_are_its_weights_and_new_rows_are_near_a_refit() -> No
     assert worst_total_variation(coupling.rows(new), refit) < 0.01
 
 
+def test_effective_sample_size_counts_equal_weights() -> None:
+    # The first observation is near two of four simulations, the second far from all.
+    simulated = torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 50.0], [0.0, -50.0]])
+    real = torch.tensor([[0.0, 0.0], [1e6, 0.0]])
+    coupling = raw_coupler(gamma=1.0, tau=0.0).couple(real, simulated)
+    sizes = coupling.effective_sample_size
+    assert sizes[0] == pytest.approx(2.0)
+    expected = 1 / coupling.weights.square().sum(dim=1)
+    assert torch.allclose(sizes, expected)
+
+
 def far_clouds() -> tuple[Tensor, Tensor, float]:
     """Two clouds so far apart, for gamma, that POT's kernel underflows."""
     real, simulated = clouds(40, 40)

@@ -100,6 +100,21 @@ def test_the_steps_are_those_of_adam_with_clipped_gradients(
     assert history.validation_loss == []
 
 
+def test_buffers_are_kept_with_the_best() -> None:
+    module = nn.BatchNorm1d(1, affine=True)
+    values = iter([3.0, 1.0, 2.0, 2.0])
+    run(
+        module,
+        lambda x: module(x).mean(),
+        lambda: torch.tensor(next(values)),
+        batches=lambda step: [(torch.full((4, 1), 10.0 * (step + 1)),)],
+        max_num_epochs=3,
+    )
+    # Kept after one step: a tenth of the way from 0 to 10.
+    assert module.running_mean is not None
+    assert float(module.running_mean) == pytest.approx(1.0)
+
+
 # --- several members ---
 
 TARGETS = torch.tensor([0.1, 1.0, 5.0])

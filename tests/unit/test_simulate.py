@@ -17,6 +17,7 @@ from sbi_rope.simulate import (
     Simulated,
     Source,
     Stored,
+    draws,
     moments,
     source_of,
     targets,
@@ -130,6 +131,33 @@ def test_rows_that_fail_are_dropped_and_counted(function: Any) -> None:
     assert torch.equal(theta, x)
     assert (theta[:, 0] <= 0.5).all()
     assert source.num_dropped == 200 - len(theta) > 20
+
+
+def test_a_failed_simulation_is_replaced_by_another_one_of_the_pair() -> None:
+    theta = torch.stack([THETA, -THETA.flip(0)])  # 1 and 0 of 3 fail
+    pairs = Pairs(
+        theta=theta,
+        x=torch.zeros(2, 2),
+        group=torch.arange(2),
+        weight=torch.ones(2),
+        label=pairs_at(theta[:, 0]).label,
+    )
+    source = simulated(fails_at_times)
+    with pytest.warns(RoPEWarning, match="Dropped 1 of 6"):
+        at, x = draws(source, pairs, 1, itself)
+    assert torch.equal(at, x)
+    assert torch.equal(at[0], THETA[[0, 0, 2]])
+    assert torch.equal(at[1], theta[1])
+    with pytest.warns(RoPEWarning):
+        assert source.at(theta, itself).isnan().sum() == 2
+    with (
+        pytest.raises(SimulationError, match=r"parameters \[\[0\.6.*\]\] failed"),
+        pytest.warns(RoPEWarning, match="Dropped 4 of 12"),
+    ):
+        moments_at(source, THETA, 4)
+    with pytest.raises(SimulationError, match="All 4 simulations") as caught:
+        moments_at(source, THETA[1:2], 4)
+    assert isinstance(caught.value.__cause__, ArithmeticError)
 
 
 def test_a_simulator_that_never_works_is_refused_with_its_error() -> None:
