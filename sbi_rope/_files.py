@@ -5,8 +5,6 @@ import secrets
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["write_atomically"]
-
 
 @contextlib.contextmanager
 def write_atomically(path: Path) -> Iterator[Path]:

@@ -11,8 +11,6 @@ from torch.distributions import Distribution, constraints
 from sbi_rope._random import seeded
 from sbi_rope.errors import InvalidInputError, shown
 
-__all__ = ["PriorDistribution", "divisors"]
-
 # Draws from which moments are estimated that a prior does not state, and those that are
 # moved apart to see whether it has bounds.
 NUM_FOR_MOMENTS, NUM_DRAWS, FAR_APART = 10_000, 256, 5.0
@@ -21,10 +19,8 @@ NUM_FOR_MOMENTS, NUM_DRAWS, FAR_APART = 10_000, 256, 5.0
 class PriorDistribution(Distribution):
     r"""A copy of a prior over parameters of shape ``(d,)``, in float32.
 
-    Priors that sbi trains with differ in their shapes, dtypes and in what they do
-    outside their support. This one does not. Its log density is minus infinity outside
-    the support, and on a bound that just inside. Where a density is flat, its gradient
-    is zero.
+    Its log density is minus infinity outside the support, and on a bound that just
+    inside. Where a density is flat, its gradient is zero.
 
     Args:
         prior: A torch distribution, or what sbi's ``process_prior`` returns.
@@ -91,11 +87,7 @@ class PriorDistribution(Distribution):
         return torch.isfinite(self.log_prob(theta))
 
     def moved_inside(self, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """Return parameters ``(n, d)``, those outside replaced, and which were inside.
-
-        Outside, networks may return anything, NaN and gradients of NaN included. What
-        was computed there is to be overwritten.
-        """
+        """Return theta ``(n, d)``, rows outside replaced, and which were inside."""
         inside = self.inside(theta)
         return theta.where(inside[:, None], self._some.to(theta)), inside
 
@@ -125,10 +117,7 @@ class PriorDistribution(Distribution):
             return None
 
     def bounds(self, like: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the ends of the support, infinite where they are not known.
-
-        They get the shape ``(*batch, d)``, dtype and device of ``like``.
-        """
+        """Return the ends of the support, like ``like``; infinite where not known."""
         return _bounds(self._support, like)
 
     def off_bounds(self, theta: Tensor) -> Tensor:
@@ -165,21 +154,15 @@ class PriorDistribution(Distribution):
     def log_units(self) -> Tensor:
         r"""Return :math:`\log s_j`, with s the standard deviations, ``(d,)``.
 
-        The density of :math:`z_j = \theta_j / s_j` is
-        :math:`p(z \mid x) = p(\theta \mid x) \prod_j s_j`, so that a log score with
-        theta in standard deviations of the prior is higher by their sum. It is NaN
-        where the prior has no finite standard deviation.
+        A log score with theta in standard deviations of the prior is higher by their
+        sum. It is NaN where the prior has no finite standard deviation.
         """
         std = self.stddev.double()
         return std.log().where((std > 0) & torch.isfinite(std), torch.nan)
 
 
 def divisors(std: Tensor) -> Tensor:
-    """Return standard deviations, or variances, with one in the place of zero.
-
-    What does not vary may be divided by them. A smallest number would be wrong for
-    parameters in units that make all of them small.
-    """
+    """Return standard deviations, or variances, with one in the place of zero."""
     return std.where(std > 0, 1.0)
 
 

@@ -6,34 +6,20 @@ from typing import Any
 
 from tqdm.auto import tqdm
 
-__all__ = ["is_shown", "progress_bar"]
-
 # A bar is drawn again after so many seconds at the earliest. In a file every drawing
 # stays, so that there are fewer of them.
 SECONDS_ON_SCREEN, SECONDS_IN_FILE = 0.1, 10.0
 
 
 def is_shown(show_progress_bars: bool | None) -> bool:  # noqa: FBT001
-    """Say whether to show progress bars, from the argument of a public function.
-
-    Args:
-        show_progress_bars: True and False decide. None shows bars where they can be
-            redrawn: in a terminal or a notebook, but not in a file.
-    """
+    """Say whether to show progress bars; None shows them where they can be redrawn."""
     return _can_redraw() if show_progress_bars is None else bool(show_progress_bars)
 
 
 def progress_bar(
     iterable: Iterable[Any] | None = None, *, show: bool, desc: str, **options: Any
 ) -> Any:
-    """Return a tqdm bar, which is silent unless ``show``.
-
-    Args:
-        iterable: What to iterate over; None for a bar that is updated by hand.
-        show: Whether to show the bar, as :func:`is_shown` says.
-        desc: The name of the bar.
-        **options: Other arguments of tqdm.
-    """
+    """Return a bar of tqdm, which is silent unless ``show``."""
     seconds = SECONDS_ON_SCREEN if _can_redraw() else SECONDS_IN_FILE
     return tqdm(iterable, desc=desc, disable=not show, mininterval=seconds, **options)
 

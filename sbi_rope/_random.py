@@ -9,23 +9,14 @@ import torch
 
 from sbi_rope.settings import Seed, check
 
-__all__ = ["seeded"]
-
 
 @contextmanager
 def seeded(seed: int | None) -> Iterator[None]:
     """Run a block with its own random numbers, or with the caller's if seed is None.
 
-    sbi's estimators and most simulators draw from the global generators of torch, NumPy
-    and Python, so that a generator object cannot be passed to them. The states of these
-    generators are restored after the block. Blocks can be nested, but not run in
-    several threads at once.
-
-    Args:
-        seed: A non-negative integer, or None.
-
-    Raises:
-        InvalidInputError: If the seed is something else.
+    These are those of the global generators of torch, NumPy and Python, from which sbi
+    and most simulators draw; their states are restored after the block. Blocks can be
+    nested, but not run in several threads at once.
     """
     check("seed", seed, Seed)
     if seed is None:

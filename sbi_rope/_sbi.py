@@ -1,10 +1,9 @@
 """Where this package touches the inside of sbi, and nowhere else.
 
 sbi keeps the embedding h (its standardising layer followed by the user's network) as
-one submodule of an estimator, under a name that depends on the family. Everything here
-finds that submodule by identity with the public property ``embedding_net``, so that it
-holds for every family; the mixed estimator of MNPE, which has no such property, is the
-exception.
+one submodule of an estimator, under a name that depends on the family. It is found by
+identity with the public property ``embedding_net``, which only the mixed estimator of
+MNPE does not have.
 """
 
 import copy
@@ -14,25 +13,31 @@ from typing import Any, Literal
 
 import torch
 from sbi.inference import NPE, DirectPosterior, VectorFieldPosterior
-from sbi.inference.posteriors.base_posterior import NeuralPosterior
+from sbi.inference.posteriors.base_posterior import NeuralPosterior as NeuralPosterior
 from sbi.inference.posteriors.filtered_direct_posterior import FilteredDirectPosterior
 from sbi.inference.posteriors.npe_a_posterior import NPE_A_Posterior
-from sbi.inference.potentials.base_potential import BasePotential
+from sbi.inference.potentials.base_potential import BasePotential as BasePotential
 from sbi.neural_nets.estimators.base import (
     ConditionalDensityEstimator,
     ConditionalEstimator,
     ConditionalVectorFieldEstimator,
-    UnconditionalDensityEstimator,
+)
+from sbi.neural_nets.estimators.base import (
+    UnconditionalDensityEstimator as UnconditionalDensityEstimator,
 )
 from sbi.neural_nets.estimators.mixed_density_estimator import MixedDensityEstimator
 from sbi.neural_nets.estimators.mixture_density_estimator import (
     MixtureDensityEstimator,
 )
 from sbi.neural_nets.estimators.tabpfn_flow import TabPFNFlow
-from sbi.neural_nets.net_builders.flow import build_zuko_unconditional_flow
-from sbi.samplers.mcmc import SliceSamplerVectorized
+from sbi.neural_nets.net_builders.flow import (
+    build_zuko_unconditional_flow as build_zuko_unconditional_flow,
+)
+from sbi.samplers.mcmc import SliceSamplerVectorized as SliceSamplerVectorized
 from sbi.utils.sbiutils import ImproperEmpirical, Standardize
-from sbi.utils.user_input_checks_utils import move_distribution_to_device
+from sbi.utils.user_input_checks_utils import (
+    move_distribution_to_device as move_distribution_to_device,
+)
 from torch import Tensor, nn
 from torch.distributions import Distribution
 from torch.utils.data import DataLoader, SubsetRandomSampler
@@ -48,38 +53,6 @@ from sbi_rope.errors import (
 )
 from sbi_rope.settings import names_of
 from sbi_rope.tensors import as_batch, rows_with
-
-__all__ = [
-    "BaseDirectPosterior",
-    "BasePotential",
-    "ConditionalDensityEstimator",
-    "ConditionalEstimator",
-    "MixedDensity",
-    "NeuralPosterior",
-    "SimulationTrainer",
-    "SliceSamplerVectorized",
-    "TrainedNPE",
-    "UnconditionalDensityEstimator",
-    "VectorFieldDensity",
-    "build_zuko_unconditional_flow",
-    "check_density",
-    "direct_posterior",
-    "embed",
-    "embedding_of",
-    "estimator_of",
-    "gaussians_of",
-    "has_parameters",
-    "headless",
-    "is_bounded",
-    "leave_out_constants",
-    "move_distribution_to_device",
-    "parameter_of",
-    "posterior_from",
-    "readable",
-    "squared_mmd",
-    "standardisation_of",
-    "with_embedding",
-]
 
 # A row may differ by this share of the largest embedding when it is alone. Rounding
 # depends on the size of a batch, and is largest for convolutions on a GPU.
@@ -100,14 +73,7 @@ def embedding_of(estimator: ConditionalEstimator) -> nn.Module:
     It includes sbi's standardising layer. Without a user-given network it is that
     layer alone; with ``z_score_x="none"`` as well it is the identity.
     """
-    if isinstance(estimator, TabPFNFlow):
-        raise UnsupportedPosteriorError(
-            "Expected an estimator whose embedding of x was trained; got TabPFNFlow "
-            "(NPE-PFN)."
-        )
     if isinstance(estimator, MixedDensityEstimator):
-        # Its two halves see x through one net. Tuning a net that only one of them uses
-        # would leave the other with the embedding of the simulations.
         embedding = estimator.condition_embedding
         if estimator.discrete_net.net.embedding_net is not embedding:
             raise UnsupportedPosteriorError(
@@ -115,20 +81,17 @@ def embedding_of(estimator: ConditionalEstimator) -> nn.Module:
                 "net; got two. Use `posterior_nn('mnpe', embedding_net=...)`."
             )
         return embedding
-    embedding = getattr(estimator, "embedding_net", None)
-    if not isinstance(embedding, nn.Module) or not _paths_to(estimator, embedding):
+    embedding: Any = getattr(estimator, "embedding_net", None)
+    if isinstance(estimator, TabPFNFlow) or not _paths_to(estimator, embedding):
         raise UnsupportedPosteriorError(
-            "Expected an estimator of sbi's posterior_nn with an embedding net; got "
-            f"{type(estimator).__name__}."
+            "Expected an estimator of sbi's posterior_nn with a trained embedding net; "
+            f"got {type(estimator).__name__}."
         )
     return embedding
 
 
 def headless(estimator: ConditionalEstimator) -> Any:
-    r"""Return :math:`q(\theta \mid h)`: the estimator without its embedding.
-
-    The parameters are shared with ``estimator``, which is left as it was.
-    """
+    r"""Return :math:`q(\theta \mid h)`, which shares the parameters of an estimator."""
     embedding = embedding_of(estimator)
     blank = parameter_of(estimator).new_zeros(1, *estimator.condition_shape)
     embedded_shape = embed(embedding, blank).shape[1:]
@@ -149,31 +112,24 @@ def with_embedding(
 ) -> Any:
     r"""Return the estimator with another embedding in the place of :math:`h`.
 
-    The other parameters are shared with ``estimator``, which is left as it was.
-
-    The ``condition_shape`` is that of what the new embedding embeds; as before if None.
+    The other parameters are shared with ``estimator``, which is left as it was. The
+    ``condition_shape`` is that of what the new net embeds; as before if None.
     """
     clone: nn.Module = estimator
     paths = _paths_to(estimator, embedding_of(estimator))
     for path in paths:
         clone = _replace(clone, path.split("."), embedding)
-    if condition_shape is None:
-        return clone
-    for path in paths:
+    for path in paths if condition_shape is not None else []:
         names = path.split(".")
         for depth in range(len(names)):
             module = clone.get_submodule(".".join(names[:depth]))
             if isinstance(module, ConditionalEstimator):
-                module._condition_shape = torch.Size(condition_shape)
+                module._condition_shape = torch.Size(condition_shape or ())
     return clone
 
 
 def embed(net: nn.Module, x: Tensor, *, batch_size: int = 1000) -> Tensor:
-    """Apply an embedding net without gradients, in batches: ``(n, *)`` to ``(n, l)``.
-
-    The net runs in evaluation mode: no dropout, and batch normalisation with its
-    trained statistics, so that the result does not depend on the batch.
-    """
+    """Apply a net in evaluation mode, in batches, without gradients, to ``(n, l)``."""
     modes = {module: module.training for module in net.modules()}
     net.eval()
     try:
@@ -186,10 +142,7 @@ def embed(net: nn.Module, x: Tensor, *, batch_size: int = 1000) -> Tensor:
 
 
 def standardisation_of(embedding_net: nn.Module) -> tuple[Tensor, Tensor] | None:
-    """Return the mean and standard deviation by which sbi standardises x.
-
-    Each has the shape of one observation or none. None if there is no such layer.
-    """
+    """Return mean and standard deviation of sbi's standardising layer, if any."""
     layers = (part for part in embedding_net.modules() if isinstance(part, Standardize))
     layer: Any = next(layers, None)
     return None if layer is None else (layer._mean, layer._std)
@@ -199,9 +152,8 @@ def standardisation_of(embedding_net: nn.Module) -> tuple[Tensor, Tensor] | None
 def leave_out_constants(embedding_net: nn.Module) -> None:
     """Make a net ignore the entries of x that were the same in all of its training.
 
-    sbi divides an entry that does not vary by 1e-7. In an observation where it does
-    vary, it would then be much larger than all other entries. The standardising layer
-    of the net is changed, so that such an entry always has the value it was trained on.
+    sbi divides them by 1e-7, so that one that does vary in an observation would be much
+    larger than all other entries.
     """
     if (mean_and_std := standardisation_of(embedding_net)) is not None:
         mean, std = mean_and_std
@@ -239,9 +191,8 @@ def _replace(root: nn.Module, path: list[str], new: nn.Module) -> nn.Module:
 def readable(net: nn.Module, x: Tensor) -> Tensor:
     """Tell which observations an embedding net can read, ``(n, *event)`` to ``(n,)``.
 
-    It can read what is finite. Where some entries are missing (NaN), it depends on the
-    net: sbi's ``PermutationInvariantEmbedding`` leaves out trials that are missing, and
-    most other nets return NaN. Nothing can be read from Inf, or if all is missing.
+    It can read what is finite. Some nets also read observations with missing entries
+    (NaN), such as sbi's ``PermutationInvariantEmbedding``; none reads Inf, or NaN only.
     """
     rows = x.flatten(1)
     finite, missing = torch.isfinite(rows), torch.isnan(rows)
@@ -290,9 +241,9 @@ def check_rows_apart(net: nn.Module, x: Tensor) -> None:
 class MixedDensity(ConditionalDensityEstimator):
     """The mixed estimator of MNPE, as a density over all of the prior's support.
 
-    Where sbi's own has no density it is zero: at a category that was not trained on,
-    which sbi gives the mass of the next larger one or refuses, and with
-    ``log_transform_x`` at zero and below, where sbi returns NaN.
+    It is zero at a category that was not trained on, which sbi gives the mass of the
+    next larger one or refuses, and with ``log_transform_x`` at zero and below, where
+    sbi returns NaN.
     """
 
     def __init__(self, estimator: MixedDensityEstimator) -> None:
@@ -320,7 +271,7 @@ class MixedDensity(ConditionalDensityEstimator):
         inside = torch.ones_like(continuous, dtype=torch.bool)
         if self.mixed.log_transform_input:
             inside = continuous > 0
-        # Anything that can be evaluated stands in for what cannot.
+        # Anything that can be evaluated stands in for what cannot be.
         some = torch.stack([values[0] for values in categories]).to(discrete)
         valid = torch.cat(
             [continuous.where(inside, 1.0), discrete.where(trained, some)], dim=-1
@@ -343,8 +294,7 @@ class MixedDensity(ConditionalDensityEstimator):
 class VectorFieldDensity(ConditionalDensityEstimator):
     """A vector field (FMPE, NPSE) in the shape of a density that can only be sampled.
 
-    Its density would need one ODE solve per component and parameter, so ``log_prob``
-    raises instead of starting hours of work.
+    Its density would need one ODE solve per component and parameter.
     """
 
     def __init__(
@@ -362,13 +312,9 @@ class VectorFieldDensity(ConditionalDensityEstimator):
         self, sample_shape: torch.Size, condition: Tensor, **kwargs: Any
     ) -> Tensor:
         """Solve the ODE or SDE for every condition; no prior support is enforced."""
-        with seeded(0):  # sbi draws from the prior to look at it
-            posterior = VectorFieldPosterior(
-                self.vector_field,
-                self.prior,
-                device=condition.device,
-                sample_with=self.sample_with,
-            )
+        posterior = _vector_field_posterior(
+            self.vector_field, self.prior, sample_with=self.sample_with
+        )
         with warnings.catch_warnings():
             # Draws outside the prior are rejected by the mixture; the batch is ours.
             warnings.simplefilter("ignore")
@@ -398,15 +344,11 @@ def gaussians_of(
 
     Given conditions ``(n, k)``, these are the logarithms of their weights up to a
     constant, ``(n, c)``, their means, ``(n, c, l)``, and covariances, ``(n, c, l, l)``,
-    all in float64. The network was built with ``z_score_x="none"``, so that they have
-    the units of what it is a density of.
+    all in float64. The network was built with ``z_score_x="none"``.
     """
-    mixture = estimator.get_uncorrected_mog(condition)
-    assert not estimator.has_input_transform
-    factors = mixture.precision_factors
-    assert factors is not None
+    mixture: Any = estimator.get_uncorrected_mog(condition)
     # In float32 a narrow covariance would not be positive definite after rounding.
-    factors = factors.double()
+    factors = mixture.precision_factors.double()
     identity = torch.eye(factors.shape[-1]).to(factors)
     precision = factors.mT @ factors + SMALLEST_PRECISION * identity
     covariances = torch.cholesky_inverse(torch.linalg.cholesky(precision))
@@ -432,25 +374,17 @@ def estimator_of(posterior: Any) -> ConditionalEstimator:
             "around one observation (TSNPE)."
         )
     if isinstance(posterior, VectorFieldPosterior):
-        estimator: Any = posterior.vector_field_estimator
-    else:
-        estimator = getattr(posterior, "posterior_estimator", None)
-        if (
-            not isinstance(posterior, DirectPosterior)
-            or isinstance(posterior, FilteredDirectPosterior | NPE_A_Posterior)
-            or hasattr(estimator, "log_q")  # a density of this package
-        ):
-            raise UnsupportedPosteriorError(
-                "Expected `posterior` to be what `NPE(...).build_posterior()` returns, "
-                "or the posterior of MNPE, FMPE or NPSE; got "
-                f"{type(posterior).__name__}."
-            )
-    for name, weights in estimator.named_parameters():
-        if not torch.isfinite(weights).all():
-            raise UnsupportedPosteriorError(
-                f"Expected an NPE with finite weights; got NaN or Inf in `{name}`, so "
-                "that its training has failed."
-            )
+        return posterior.vector_field_estimator
+    estimator: Any = getattr(posterior, "posterior_estimator", None)
+    if (
+        not isinstance(posterior, DirectPosterior)
+        or isinstance(posterior, FilteredDirectPosterior | NPE_A_Posterior)
+        or hasattr(estimator, "log_q")  # a density of this package
+    ):
+        raise UnsupportedPosteriorError(
+            "Expected `posterior` to be what `NPE(...).build_posterior()` returns, or "
+            f"the posterior of MNPE, FMPE or NPSE; got {type(posterior).__name__}."
+        )
     return estimator
 
 
@@ -468,10 +402,7 @@ def check_density(
 
 
 def is_bounded(posterior: DirectPosterior) -> bool:
-    """Tell whether a posterior normalises by other means than sbi's own rejection.
-
-    That goes on until enough draws are inside the prior, which may be for ever.
-    """
+    """Tell whether a posterior does without sbi's rejection, which may never end."""
     # NPE_A_Posterior of sbi has a method of its own, but of the same kind.
     return type(posterior).leakage_correction.__module__.split(".")[0] != "sbi"
 
@@ -484,14 +415,20 @@ def posterior_from(
         return direct_posterior(
             estimator, posterior.prior, enable_transform=posterior.enable_transform
         )
+    return _vector_field_posterior(
+        estimator,
+        copy.deepcopy(posterior.prior),
+        enable_transform=posterior.enable_transform,
+        sample_with=posterior.sample_with,
+    )
+
+
+def _vector_field_posterior(
+    estimator: Any, prior: Distribution, **options: Any
+) -> VectorFieldPosterior:
+    device = parameter_of(estimator).device
     with seeded(0):  # sbi draws from the prior to look at it
-        return VectorFieldPosterior(
-            estimator,
-            copy.deepcopy(posterior.prior),
-            device=parameter_of(estimator).device,
-            enable_transform=posterior.enable_transform,
-            sample_with=posterior.sample_with,
-        )
+        return VectorFieldPosterior(estimator, prior, device=device, **options)
 
 
 def direct_posterior(
@@ -513,10 +450,9 @@ def direct_posterior(
 class BaseDirectPosterior(DirectPosterior):
     """sbi's DirectPosterior, for our own posteriors to derive from.
 
-    ``map()`` shows the progress of its draws only if it was asked to, and never returns
-    less than the best of its starting points. Shallow copies share no state. What
-    checks an observation is :meth:`_one_x`: sbi itself refuses any NaN, which some
-    embedding nets can read.
+    ``map()`` shows progress only if asked to, and never returns less than the best of
+    its starting points. Shallow copies share no state. Observations are checked by
+    :meth:`_one_x`: sbi itself refuses any NaN, which some embedding nets can read.
     """
 
     def _one_x(self, x: Any) -> Tensor:
@@ -557,23 +493,20 @@ class BaseDirectPosterior(DirectPosterior):
             return found
         # Where no step improves on the best start, sbi transforms that start a second
         # time and returns another point.
-        heights = self.potential_fn(init_method)
-        start = init_method[heights.argmax()].reshape(1, -1)
-        improved = self.potential_fn(found.reshape(1, -1)) >= heights.max()
-        return found.reshape(1, -1) if bool(improved) else start
+        heights, found = self.potential_fn(init_method), found.reshape(1, -1)
+        if bool(self.potential_fn(found) >= heights.max()):
+            return found
+        return init_method[heights.argmax()].reshape(1, -1)
 
 
 class TrainedNPE:
     r"""A copy of a trained estimator :math:`q(\theta \mid h(x))`, in its two parts.
 
-    Estimator and prior are copied, and all that is returned is a copy again.
-
     Attributes:
         estimator: The copy of the estimator, in evaluation mode.
         prior: The copy of the prior, with one set of shapes.
         h: The embedding net of the copy, with sbi's standardising layer.
-        like: An empty tensor of shape ``(0, d)`` with the dtype and device of the
-            estimator.
+        like: An empty tensor ``(0, d)`` with the dtype and device of the estimator.
         parameter_names: The names of the parameters; None if there are none.
         x_names: The names of the columns of tables of x; None if they are not known.
     """
@@ -665,13 +598,9 @@ class TrainedNPE:
 class SimulationTrainer(NPE):
     """sbi's NPE, which holds simulations of the same parameters out together.
 
-    Where a few stored people are recorded many times, a network can learn them by
-    heart; only people it has not met say when to stop. Recordings of a single person
-    are split one by one.
-
-    It shows a progress bar on stderr, or nothing. sbi prints to stdout, a line for each
-    epoch in a log file, and prints that it has converged even if it was asked to be
-    quiet.
+    A network can learn a few stored people that are recorded many times by heart; only
+    people it has not met say when to stop. Recordings of a single person are split one
+    by one. It shows a progress bar on stderr, or nothing, where sbi prints to stdout.
 
     Args:
         change_x: Applied to the x of every batch before its loss is taken.
@@ -717,12 +646,8 @@ class SimulationTrainer(NPE):
             dataloader_kwargs,
         )
         if split is not None and not len(held_out):
-            rows = self.val_indices
-            held_out = DataLoader(
-                held_out.dataset,
-                batch_size=len(rows),
-                sampler=SubsetRandomSampler(rows.tolist()),
-            )
+            rows: Any = SubsetRandomSampler(split[1].tolist())
+            held_out = DataLoader(held_out.dataset, len(split[1]), sampler=rows)
         return train, held_out
 
     def _maybe_show_progress(self, show: bool, epoch: int) -> None:  # type: ignore[override]  # noqa: FBT001
@@ -738,11 +663,9 @@ class SimulationTrainer(NPE):
     def _loss(self, theta: Tensor, x: Tensor, *args: Any, **kwargs: Any) -> Tensor:
         if self._change_x is not None:
             x = self._change_x(x)
-        loss = super()._loss(theta, x, *args, **kwargs)
-        assert self._neural_net is not None
-        if self._penalty is None or not self._neural_net.training:
-            return loss
-        penalty = self._penalty(self._neural_net)
+        loss, net = super()._loss(theta, x, *args, **kwargs), self._neural_net
+        assert net is not None
+        penalty = self._penalty(net) if self._penalty and net.training else None
         return loss if penalty is None else loss + penalty
 
 
@@ -779,12 +702,8 @@ class _NoTracker:
 
 
 def squared_mmd(a: Tensor, b: Tensor) -> float:
-    """Return the squared MMD of two sets, ``(n, l)`` and ``(m, l)``.
-
-    The kernel is Gaussian. Its width is the median distance between the sets.
-    """
-    # It is imported here because it needs packages that nothing else here needs. sbi's
-    # `calc_misspecification_mmd` would compute one more MMD, for its p-value.
+    """Return the squared MMD of two sets, Gaussian, of the median width."""
+    # It needs packages that nothing else here needs.
     from sbi.diagnostics.misspecification import compute_rbf_mmd_median_heuristic
 
     return float(compute_rbf_mmd_median_heuristic(a, b))

@@ -6,17 +6,8 @@ from torch import Tensor, nn
 from sbi_rope._sbi import standardisation_of
 from sbi_rope.errors import warn_user
 
-__all__ = [
-    "FAR",
-    "ROUNDING",
-    "Standardisation",
-    "deviations",
-    "warn_of_far_entries",
-]
-
 # An entry is far if it is more than so many standard deviations away from simulations.
-# No measurement of the tasks is half as far away. A column that is constant in
-# simulations but varies by 0.01 in reality is 100,000 away.
+# No measurement of the tasks is half as far away.
 FAR = 30.0
 # A standard deviation smaller than this share of the mean is taken for rounding error.
 ROUNDING = 1e-6
@@ -27,9 +18,8 @@ def deviations(embedding_net: nn.Module, x: Tensor) -> Tensor | None:
 
     .. math:: |x - \bar x_s| / \operatorname{sd}(x_s)
 
-    It has the shape of x, ``(n, *event)``, and is zero for missing entries (NaN). The
-    mean and standard deviation are those of sbi's standardising layer, with which the
-    net of a trained estimator starts. Without this layer it is None.
+    It has the shape of x, ``(n, *event)``, and is zero for missing entries (NaN). It is
+    None if the net has no standardising layer of sbi, which knows the simulations.
     """
     mean_and_std = standardisation_of(embedding_net)
     if mean_and_std is None:

@@ -1,7 +1,6 @@
 """Calibration pairs: what was measured, of whom, and how much each pair counts.
 
-Pairs of one person or specimen belong to one group. They are held out together, because
-a network can learn by heart whom it has met.
+A group is held out as a whole, because a network can learn by heart whom it has met.
 """
 
 import math
@@ -15,21 +14,6 @@ from torch import Tensor
 from sbi_rope._random import seeded
 from sbi_rope.errors import InvalidInputError
 
-__all__ = [
-    "MIN_PAIRS_FOR_HOLDOUT",
-    "Labels",
-    "Nodes",
-    "Pairs",
-    "effective_number",
-    "group_means",
-    "groups_of",
-    "groups_to_hold_out",
-    "one_of_each_group",
-    "split_groups",
-    "split_pairs",
-    "too_few_pairs",
-]
-
 # Fewer groups than this leave nothing to hold out.
 MIN_PAIRS_FOR_HOLDOUT = 5
 
@@ -40,18 +24,14 @@ Table = TypeVar("Table")
 class Labels:
     r"""What was measured of the parameters of pairs.
 
-    A label is a measurement of some or all parameters m, exact where R is zero,
-
-    .. math:: y_m \sim \mathcal N(\theta_m, R),
-
-    or draws of all parameters from :math:`p(\theta \mid \text{label})`, under the prior
-    of NPE.
+    A label is a measurement of some or all parameters, exact where R is zero,
+    :math:`y \sim \mathcal N(\theta, R)`, or draws of all parameters from
+    :math:`p(\theta \mid \text{label})` under the prior of NPE.
 
     Attributes:
         y: The measurements, NaN where there are none, shape ``(n, d)``. Of a label
             given as draws, their mean.
-        covariance: R, zero for exact and for missing parameters, float64, shape
-            ``(n, d, d)``.
+        covariance: R, zero for exact and missing parameters, ``(n, d, d)``, float64.
         draws: Shape ``(n, S, d)``; S is zero for measurements.
     """
 
@@ -201,11 +181,9 @@ class Pairs:
             num_partial = int((~self.label.is_measured).any(dim=1).sum())
             text += f", {num_noisy} with noise and {num_partial} partial"
         if (self.weight != 1).any():
-            number = effective_number(self.weight)
-            text += (
-                f", weighted like {number:.1f} of equal weight, and counted as "
-                f"{float(self.weight.sum()):.3g}"
-            )
+            number, total = effective_number(self.weight), self.weight.sum()
+            text += f", weighted like {number:.1f} of equal weight"
+            text += f", and counted as {float(total):.3g}"
         return text
 
 
@@ -216,10 +194,9 @@ class Nodes:
     .. math:: p(y_i \mid x_i) \approx \frac1S \sum_s u_{is}\, q(\theta_{is} \mid x_i)
 
     Attributes:
-        theta: Shape ``(n, S, d)``, in the dtype of the labels. All are inside the
-            support of the prior, so that those with no weight do no harm to gradients.
-        log_weights: :math:`\log u`, minus infinity outside the support of the prior,
-            shape ``(n, S)``, float64.
+        theta: Shape ``(n, S, d)``, all inside the support of the prior.
+        log_weights: :math:`\log u`, shape ``(n, S)``, float64. Minus infinity where
+            theta was outside the support, and was replaced.
     """
 
     theta: Tensor
@@ -315,7 +292,7 @@ def split_pairs(
 
     Groups are held out as a whole, in random order, as long as they bring the number of
     rows nearer to the fraction asked for, or else the smallest. Of fewer than five
-    groups none is held out. The first argument is that of :func:`groups_of`.
+    groups none is held out.
     """
     groups = groups_of(theta_or_groups)
     sizes = torch.bincount(groups)
@@ -331,14 +308,9 @@ def split_pairs(
 
 
 def split_groups(groups: Tensor, num_folds: int) -> list[Tensor]:
-    """Cut rows into folds at random, with the rows of a group in the same fold.
-
-    There are at most as many folds as groups, with equally many rows as far as the
-    groups allow.
-    """
-    # Not by scikit-learn's GroupKFold: it refuses fewer groups than folds, and in which
-    # order it takes groups of equal size depends on its version. Stored results depend
-    # on who was in which fold.
+    """Cut rows into folds of like size at random; a group is in one fold."""
+    # scikit-learn's GroupKFold refuses fewer groups than folds, and in which order it
+    # takes groups of equal size depends on its version.
     groups = groups_of(groups)
     sizes = torch.bincount(groups)
     order = torch.randperm(len(sizes))
@@ -355,10 +327,7 @@ def split_groups(groups: Tensor, num_folds: int) -> list[Tensor]:
 
 
 def groups_to_hold_out(wanted: int, sizes: list[int]) -> list[int]:
-    """Choose groups of these sizes, in this order, with about as many rows as wanted.
-
-    Some are chosen, but not all. If all groups are too large, it is the smallest.
-    """
+    """Choose some groups, in order, with some ``wanted`` rows, or the smallest."""
     chosen, total = [], 0
     for index, size in enumerate(sizes):
         if total + size - wanted <= wanted - total:
@@ -372,12 +341,10 @@ def groups_to_hold_out(wanted: int, sizes: list[int]) -> list[int]:
 def too_few_pairs(theta_or_groups: Tensor) -> str:
     """Say in words, for a warning, that these pairs are too few to hold some out."""
     groups = groups_of(theta_or_groups)
-    if (num_groups := len(groups.unique())) == len(groups):
-        return f"Only {len(groups)} calibration pair(s)"
-    return (
-        f"Only {num_groups} different parameters (or groups) among {len(groups)} "
-        "calibration pairs"
-    )
+    count, some = len(groups.unique()), f"{len(groups)} calibration pairs"
+    if count == len(groups):
+        return f"Only {some}"
+    return f"Only {count} different parameters (or groups) among {some}"
 
 
 def _map(function: Callable[..., Any], first: Table, *others: Table) -> Table:

@@ -22,8 +22,6 @@ from torch import Tensor, nn
 from sbi_rope._random import seeded
 from sbi_rope.errors import SamplingError
 
-__all__ = ["Ensemble", "drawn", "embedded", "log_density", "loss_of", "resize"]
-
 # What is asked of a network: its answers to rows. The first argument is the network.
 Question = Callable[..., Tensor]
 

@@ -8,23 +8,6 @@ import inspect
 import warnings
 from typing import Any
 
-__all__ = [
-    "CouplingError",
-    "DataNotFoundError",
-    "FileFormatError",
-    "InvalidInputError",
-    "LogProbUnavailableError",
-    "NotReadyError",
-    "RoPEError",
-    "RoPEWarning",
-    "SamplingError",
-    "SimulationError",
-    "UnsupportedPosteriorError",
-    "shown",
-    "warn_user",
-]
-
-
 # The most characters of a value that a message shows.
 LONGEST_TEXT = 200
 # Warnings point at no line of these packages.

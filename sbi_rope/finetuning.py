@@ -12,11 +12,11 @@ from torch import Tensor, nn
 
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
-from sbi_rope._sbi import embed
+from sbi_rope._sbi import embed, has_parameters
 from sbi_rope.data import Nodes, split_pairs
 from sbi_rope.density.flow import Flow
 from sbi_rope.ensemble import Ensemble, embedded
-from sbi_rope.errors import InvalidInputError, warn_user
+from sbi_rope.errors import warn_user
 from sbi_rope.fit import History, Training, epochs_on_pairs, fit
 from sbi_rope.settings import Count, NotNegative, Positive, Range, Settings, check
 from sbi_rope.tensors import as_batch
@@ -30,12 +30,7 @@ REHEARSED_IN_EPOCH = 50
 
 @dataclass(frozen=True, eq=False)
 class FinetuneResult:
-    """The fine-tuned embedding net and the course of its training.
-
-    Attributes:
-        embedding_net: :math:`g`, in evaluation mode.
-        history: The losses, and the epoch that was kept.
-    """
+    """The tuned embedding net, in evaluation mode, and the course of its training."""
 
     embedding_net: nn.Module
     history: History
@@ -53,17 +48,14 @@ class CalibrationFinetuner(Settings):
         \Bigr\rVert_2,
 
     starting from g = h, with Adam on all training pairs at once. A fifth of the pairs
-    is held out; pairs of the same group are held out together. Of all epochs,
-    including the start, the g with the smallest loss on the held-out pairs is kept. On
-    these pairs, tuning therefore never makes g worse than h.
+    is held out, groups as a whole. Of all epochs, including the start, the g with the
+    smallest loss on the held-out pairs is kept.
 
     With ``rehearsal`` :math:`\lambda > 0` it also minimises, over simulations from the
     prior, :math:`\lambda\, \mathbb{E} \lVert g(x_s) - h(x_s) \rVert_2`, which is not in
-    the paper. In continual learning this is called rehearsal with feature distillation:
-    g learns from h on simulations, so that it does not forget how h embeds them. It
-    helps if a large net is tuned on few pairs; ``docs/background/benchmark.md`` says
-    where it helps and where it does harm. The loss on the held-out pairs does not
-    contain it.
+    the paper, so that g does not forget how h embeds simulations. It helps if a large
+    net is tuned on few pairs (``docs/background/benchmark.md``). The loss on the
+    held-out pairs does not contain it.
 
     The net is tuned in evaluation mode (no dropout, fixed batch statistics). If h has
     no trainable parameters, because NPE was trained without an embedding net, g is h
@@ -77,10 +69,9 @@ class CalibrationFinetuner(Settings):
         | https://arxiv.org/abs/1606.09282
 
     Args:
-        learning_rate: The step size of Adam. If there are several, a net is tuned with
-            each of them, and the one with the smallest loss on the held-out pairs is
-            kept. With too few pairs for a hold-out, an embedding net is tuned with the
-            smallest rate and an affine map with the largest, which suits them best.
+        learning_rate: The step size of Adam. Of several, the one with the smallest loss
+            on the held-out pairs is kept. With too few pairs for a hold-out, an
+            embedding net is tuned with the smallest and an affine map with the largest.
         max_num_epochs: The largest number of epochs. Each is one gradient step over all
             training pairs.
         stop_after_epochs: Training stops after this many epochs without a smaller loss
@@ -89,11 +80,9 @@ class CalibrationFinetuner(Settings):
             each expectation. With 1, as in the paper, g is pulled towards the noise of
             single simulations.
         resample_targets: Whether to draw new simulations in every epoch, as the paper
-            does, instead of once before the first. This takes ``max_num_epochs`` times
-            as many simulations.
-        num_neighbors: With stored simulations instead of a simulator, the expectation
-            is estimated by the mean over this many simulations with the nearest
-            parameters.
+            does, instead of once before the first.
+        num_neighbors: With stored simulations, the expectation is estimated by the mean
+            over this many simulations with the nearest parameters.
         validation_fraction: The share of the pairs that is held out, at most 0.5.
         rehearsal: :math:`\lambda`, not negative. The default is 0, as in the paper.
     """
@@ -127,11 +116,9 @@ class CalibrationFinetuner(Settings):
             draw_targets: A function of a number k that returns the mean embedding of k
                 simulations for each pair, shape ``(n_c, l)``.
             draw_simulations: A function of a number k that returns up to k simulations
-                from the prior, shape ``(k, *event)``. It is only called for
-                ``rehearsal``.
-            groups: A number for each pair, shape ``(n_c,)``. Pairs with the same
-                number, such as recordings of one person, are held out together. None
-                if all pairs have different parameters.
+                from the prior, shape ``(k, *event)``, for ``rehearsal``.
+            groups: A number for each pair, shape ``(n_c,)``. Pairs with the same number
+                are held out together. None if all pairs have different parameters.
             weights: How many pairs each pair counts as, shape ``(n_c,)``; one if None.
             seed: Seed of the split and of the simulations; None uses torch's state.
             show_progress_bars: Whether to show the losses during training. None does so
@@ -186,16 +173,10 @@ class CalibrationFinetuner(Settings):
         """
         kept = None
         if self.rehearsal:
-            if draw_simulations is None:
-                raise InvalidInputError(
-                    f"Expected `draw_simulations` with rehearsal={self.rehearsal}; got "
-                    "None."
-                )
-            simulations = draw_simulations(NUM_REHEARSED).to(x.dtype)
-            kept = (
-                simulations,
-                as_batch("embeddings of simulations", embed(h, simulations)),
-            )
+            check("draw_simulations", draw_simulations, Callable)
+            simulations = draw_simulations(NUM_REHEARSED).to(x.dtype)  # type: ignore[misc]
+            simulated = as_batch("embeddings of simulations", embed(h, simulations))
+            kept = (simulations, simulated)
         splits = []
         for rows in sets:
             parts = split_pairs(groups[rows.cpu()], self.validation_fraction)
@@ -208,8 +189,7 @@ class CalibrationFinetuner(Settings):
         rates = list(rates) if isinstance(rates, tuple) else [rates]
         if not len(fewest[1]):
             # The careful rate for a net, the larger for an affine map.
-            is_net = any(True for _ in h.parameters())
-            rates = [min(rates) if is_net else max(rates)]
+            rates = [min(rates) if has_parameters(h) else max(rates)]
             splits = [(rows, rows[:0]) for rows in sets]
         count, num_nets = len(rates), len(rates) * len(sets)
         nets = Ensemble([trainable_copy(h, targets[0])] * num_nets, embedded, (x[:3],))
@@ -242,15 +222,14 @@ class CalibrationFinetuner(Settings):
             rehearsed = distances(kept[0][some], kept[1][some]).mean(dim=1)
             return found + self.rehearsal * rehearsed
 
+        training = Training(
+            stop_after_epochs=self.stop_after_epochs, clip_max_norm=None
+        )
         histories = fit(
             nets,
             batches,
             loss,
-            Training(
-                max_num_epochs=self.max_num_epochs,
-                stop_after_epochs=self.stop_after_epochs,
-                clip_max_norm=None,
-            ),
+            training,
             validation_loss=mean_distance if len(held_out) else None,
             held_out=(held_out, fixed),
             learning_rates=rates * len(sets),
@@ -263,9 +242,8 @@ class CalibrationFinetuner(Settings):
         return nets[best], [histories[k] for k in best]
 
 
-# With rehearsal, g embeds simulations as h does, so that the density can interpret
-# them. The rate and the patience take an eighth of the time of the finetuner's defaults
-# and did not increase the distances on calibration data.
+# The rate and the patience take an eighth of the time of the finetuner's defaults and
+# did not increase the distances on calibration data.
 TUNING = CalibrationFinetuner(rehearsal=1.0, learning_rate=3e-3, stop_after_epochs=50)
 
 
@@ -316,8 +294,7 @@ def finetune_flow(
     taken, and the rows that it is trained on and holds out. All see the same x,
     ``(n, *event)``. With ``only_densities`` the net, which all flows share, stays as it
     is. A large net that keeps seeing ``rehearsed`` simulations (theta, x) learns more
-    from the pairs before it overfits. The mean over the pairs and that over simulations
-    count half each then.
+    from the pairs before it overfits; both means count half then.
     """
     network = flow.densities if only_densities else flow
     fixed = flow.embed(x)[:, 0] if only_densities else None
@@ -386,11 +363,7 @@ def finetune_flow(
 def _with_density(
     losses: Callable[[Tensor], Tensor], rows: Sequence[Tensor]
 ) -> list[Tensor]:
-    """Return the rows of each flow whose loss is finite; warn of the others.
-
-    A label exactly on a bound of the prior has an infinite loss if the density is zero
-    there, which would end the training.
-    """
+    """Return the rows of each flow whose loss is finite; warn of the others."""
     padded = Padded.of(rows, None)
     if not len(padded):
         return list(rows)
@@ -466,12 +439,9 @@ class Padded:
 
 
 def trainable_copy(embedding_net: nn.Module, embeddings: Tensor) -> nn.Module:
-    """Copy a net so that all of it can be trained, in evaluation mode.
-
-    ``embeddings`` is any batch of its outputs, shape ``(n, l)``.
-    """
+    """Copy a net so that all of it can be trained; without parameters, add a layer."""
     net = copy.deepcopy(embedding_net).requires_grad_()
-    if not any(True for _ in net.parameters()):
+    if not has_parameters(net):
         width = embeddings.shape[1]
         affine = nn.Linear(width, width).to(embeddings)
         with torch.no_grad():

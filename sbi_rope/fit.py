@@ -16,18 +16,6 @@ from sbi_rope.ensemble import resize
 from sbi_rope.errors import RoPEWarning, warn_user
 from sbi_rope.settings import Count, Level, Positive, Settings
 
-__all__ = [
-    "EPOCHS_WITHOUT_HOLDOUT",
-    "Courses",
-    "History",
-    "Training",
-    "epochs_on_pairs",
-    "fit",
-    "fit_on_pairs",
-    "shuffled",
-    "without_warning_of_few_pairs",
-]
-
 # Without a hold-out nothing says when to stop, so little is risked.
 EPOCHS_WITHOUT_HOLDOUT = 50
 # More epochs than this are no limit.
@@ -68,16 +56,14 @@ class Training(Settings):
 class History:
     """The course of a training, for plotting.
 
-    An epoch is a pass over the training data. For ``CalibrationFinetuner`` it is one
-    gradient step over all pairs. What sbi's trainers report starts after the first
-    epoch, which is number 0 then.
+    An epoch is a pass over the training data, of ``CalibrationFinetuner`` one step.
 
     Attributes:
         training_loss: Mean loss over the training data during each epoch; of a
             fine-tuning, the distance in units of the embedding, with rehearsal the
             weighted sum of both distances.
-        validation_loss: Loss over the held-out data before each epoch and after the
-            last; empty without a hold-out.
+        validation_loss: Loss over the hold-out set before each epoch and after the last
+            (of sbi's trainers, after each); empty without a hold-out set.
         best_epoch: Number of epochs after which the kept net was reached; 0 is the
             starting point.
         learning_rate: The learning rate of this course, the best of those tried.
@@ -97,11 +83,10 @@ class History:
 
 @dataclass(frozen=True)
 class Courses:
-    """Trainings that follow each other, each from the better of two states.
+    """Trainings that follow each other; in each the step size falls to zero.
 
-    In a course the step size falls to zero. A course after which the validation loss is
-    higher is not kept: the member goes on from the better state with a smaller step
-    size.
+    After a course that made the validation loss worse, the member goes on from the
+    better state with a smaller step size.
 
     Attributes:
         min_gain: What a course has to gain for another to follow.
@@ -133,22 +118,20 @@ def fit(
     label: str,
     show_progress_bars: bool,
 ) -> list[History]:
-    """Train networks in place with Adam; leave each at its best on its held-out data.
+    """Train networks in place with Adam; leave each at its best on its hold-out set.
 
-    The starting point competes, so that training never returns something worse than it
-    started from on the held-out data. Without a hold-out the last state is kept. A
-    member of an ensemble stops by itself, and a loss that is not finite stops only the
-    member whose loss it is.
+    The starting point competes. Without a hold-out set the last state is kept. A member
+    of an ensemble stops by itself, also if its loss is not finite.
 
     Args:
-        network: What to train: a module, or E members whose parameters are stacked.
-            Parameters that require no gradient are left alone, unless none does.
+        network: A module, or E members whose parameters are stacked. Parameters that
+            require no gradient are left alone, unless none does.
         batches: Given the number of the epoch, the batches to pass over. Each part of
             a batch for an ensemble has the rows of member e at ``part[e]``.
         loss: Of a batch, the mean loss of each member, ``(E,)``, or of the module.
             Members that have stopped are not in the batch and in the network any more.
         training: Learning rate and so on; ``batches`` has the size of the batches.
-        validation_loss: The loss over the held-out data, if there are any.
+        validation_loss: The loss over the hold-out set, if there is one.
         held_out: The batch that ``validation_loss`` is called with.
         courses: Whether ``max_num_epochs`` are a course that others may follow, after
             which the validation loss is computed.
@@ -162,7 +145,10 @@ def fit(
     if not any(parameter.requires_grad for parameter in network.parameters()):
         network.requires_grad_()
     optimiser = _Adam(network, training.clip_max_norm)
-    buffers, E = _buffers(network), optimiser.num_members
+    E = optimiser.num_members
+    # Members of ensembles share buffers, which stay as they are.
+    own = [] if hasattr(network, "num_members") else network.buffers()
+    buffers = [buffer.detach()[None] for buffer in own]
     given = learning_rates or [training.learning_rate] * E
     rates = torch.tensor(given, dtype=torch.double)
     length, start = max_num_epochs or training.max_num_epochs, 0
@@ -179,12 +165,13 @@ def fit(
     def of_members(batch: Sequence[Any]) -> Sequence[Any]:
         return batch if len(members) == E else [of_all[members] for of_all in batch]
 
+    def append(losses: list[list[float]], new: Tensor) -> None:
+        for e, value in zip(members.tolist(), new.tolist(), strict=True):
+            losses[e].append(value)
+
+    total = last if last < LARGEST_LIMIT else math.inf
     progress = progress_bar(
-        range(last + 1),
-        show=show_progress_bars,
-        # Training without a limit ends where the loss does not fall any more.
-        total=last if last < LARGEST_LIMIT else math.inf,
-        desc=label,
+        range(last + 1), show=show_progress_bars, total=total, desc=label
     )
     network.eval()
     for epoch in progress:
@@ -199,7 +186,7 @@ def fit(
             gain = best_loss[members] - score
             better = going & (gain > 0)  # never for NaN
             best_loss[members[better]] = score[better]
-            _append(scores, members, score)
+            append(scores, score)
         best_epoch[members[better]] = epoch
         for kept, value in zip(best, state, strict=True):
             kept[members[better]] = value[better]
@@ -238,7 +225,7 @@ def fit(
                 of_batches.append(value.detach())
         if in_training_mode:
             network.eval()
-        _append(training_loss, members, torch.stack(of_batches).double().mean(dim=0))
+        append(training_loss, torch.stack(of_batches).double().mean(dim=0))
         num_lost += int((going & ~finite).sum())
         going &= finite
         losses = scores if validation_loss is not None else training_loss
@@ -261,11 +248,6 @@ def fit(
         )
         for e in range(E)
     ]
-
-
-def _append(losses: list[list[float]], members: Tensor, new: Tensor) -> None:
-    for e, value in zip(members.tolist(), new.tolist(), strict=True):
-        losses[e].append(value)
 
 
 def _fall(losses: Sequence[float], length: int) -> float:
@@ -358,11 +340,9 @@ class _Adam:
             losses[finite].sum(), self.parameters, allow_unused=True
         )
         with torch.no_grad():
+            pairs = zip(gradients, self.parameters, strict=True)
             gradient = self._side_by_side(
-                [
-                    torch.zeros_like(parameter) if one is None else one
-                    for one, parameter in zip(gradients, self.parameters, strict=True)
-                ]
+                [torch.zeros_like(of) if one is None else one for one, of in pairs]
             )
             norm = gradient.norm(dim=1, keepdim=True)
             if not torch.isfinite(norm).all():
@@ -388,19 +368,9 @@ class _Adam:
             parameter.data = part.view((-1, *shape[1:]) if shape else ())
 
 
-def _buffers(network: nn.Module) -> list[Tensor]:
-    """Return the buffers of a module, each ``(1, ...)``; members of ensembles share."""
-    stacked = hasattr(network, "num_members")
-    return [] if stacked else [buffer.detach()[None] for buffer in network.buffers()]
-
-
 @contextmanager
 def differentiable(module: nn.Module) -> Iterator[None]:
-    """Compute the gradients of a module, also where the caller has switched them off.
-
-    cuDNN has no gradients of recurrent nets in evaluation mode, which the slower code
-    of torch has.
-    """
+    """Compute the gradients of a module, also where the caller switched them off."""
     is_recurrent = any(isinstance(part, nn.RNNBase) for part in module.modules())
     is_slow = is_recurrent and not module.training
     context = torch.backends.cudnn.flags(enabled=False) if is_slow else nullcontext()

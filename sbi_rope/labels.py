@@ -5,14 +5,15 @@ The density of a label y given x averages a posterior over what the label leaves
 .. math:: p(y \mid x) = \int q(\theta \mid x)\, p(y \mid \theta)\, d\theta ,
 
 where exact parameters are fixed and :math:`p(y \mid \theta)` is one for missing ones.
-It is estimated by importance sampling at nodes from a mixture of Student t
-distributions. Each is a reference posterior, taken for normal and updated with the
-label by the formulas of the Kalman filter. References are the posteriors to be scored
-and the prior, so that no density is much larger than the mixture.
+It is estimated by importance sampling from a mixture of Student t distributions, each a
+reference posterior, taken for normal and updated with the label as in a Kalman filter.
+References are the posteriors to be scored and the prior, so that no density is much
+larger than the mixture.
 """
 
 import math
 from collections.abc import Hashable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -25,18 +26,6 @@ from sbi_rope.data import Labels, Nodes
 from sbi_rope.errors import InvalidInputError, warn_user
 from sbi_rope.settings import default_names
 from sbi_rope.tensors import as_batch, as_numbers, check_in_support, rows_with
-
-__all__ = [
-    "Reference",
-    "draws_of",
-    "given_groups",
-    "given_labels",
-    "given_weights",
-    "nodes_of",
-    "on_bounds",
-    "place_nodes",
-    "reference_of",
-]
 
 # A covariance may be this much asymmetric, relative to its diagonal, and a correlation
 # with a smaller eigenvalue than the second number is singular.
@@ -69,10 +58,7 @@ def given_labels(
     prior: PriorDistribution,
     names: Sequence[str] | None,
 ) -> Labels:
-    """Return labels from the arguments of :meth:`RoPE.append_calibration`.
-
-    They get the dtype and device of ``like``, a tensor of shape ``(0, d)``.
-    """
+    """Return labels, like ``like``, from the arguments of ``append_calibration``."""
     dim = like.shape[1]
     theta = as_numbers("theta", theta, device=like.device, names=names)
     event_shape = (theta.shape[1], dim) if theta.ndim == 3 else (dim,)
@@ -92,10 +78,9 @@ def given_labels(
             )
         check_in_support("theta", theta.reshape(-1, dim), prior)
         mean = Labels.exact(theta.double().mean(dim=1).to(theta))
-        return Labels(y=mean.y, covariance=mean.covariance, draws=theta)
+        return replace(mean, draws=theta)
     covariance = _given_covariance(~torch.isnan(theta), theta_std, theta_cov, names)
-    none = theta.new_empty(len(theta), 0, dim)
-    labels = Labels(y=theta, covariance=covariance, draws=none)
+    labels = replace(Labels.exact(theta), covariance=covariance)
     # Noise may move a label out of the prior, but an exact one must be inside.
     check_in_support("theta", theta, prior, rows=labels.is_exact)
     return labels
@@ -147,18 +132,16 @@ def _given_covariance(
         return torch.diag_embed(std.square())
     covariance = as_numbers("theta_cov", theta_cov, device=device)
     covariance = _expanded("theta_cov", covariance, (d, d), (n, d, d))
-    both = measured[:, :, None] & measured[:, None, :]
-    covariance = covariance.where(both, 0.0)
-    bad = ~torch.isfinite(covariance).flatten(1).all(dim=1)
+    covariance = covariance.where(measured[:, :, None] & measured[:, None, :], 0.0)
     # Relative to the standard deviations, because parameters may have different units.
-    variance = covariance.diagonal(dim1=1, dim2=2).nan_to_num()
+    variance = covariance.diagonal(dim1=1, dim2=2)
     noisy = variance > 0
     std = variance.where(noisy, 1.0).sqrt()
-    correlation = covariance.nan_to_num() / (std[:, :, None] * std[:, None, :])
-    bad |= (correlation - correlation.mT).abs().amax(dim=(1, 2)) > ROUNDING
+    correlation = covariance / (std[:, :, None] * std[:, None, :])
     # Noisy parameters may have no direction without noise, which has no density.
     regular = (correlation + correlation.mT) / 2 + torch.diag_embed((~noisy).double())
-    bad |= torch.linalg.eigvalsh(regular)[:, 0] <= SINGULAR
+    bad = ~((correlation - correlation.mT).abs().amax(dim=(1, 2)) <= ROUNDING)
+    bad |= torch.linalg.eigvalsh(regular.nan_to_num())[:, 0] <= SINGULAR
     if bad.any():
         raise InvalidInputError(
             "Expected `theta_cov` to be finite, symmetric, and positive definite for "
@@ -180,10 +163,7 @@ def _expanded(name: str, value: Tensor, *shapes: tuple[int, ...]) -> Tensor:
 def on_bounds(
     labels: Labels, prior: PriorDistribution, names: Sequence[str] | None
 ) -> list[str]:
-    """Say of which parameters many exact labels are on a bound of the prior.
-
-    A posterior with a density does not expect any such label.
-    """
+    """Say of which parameters many exact labels are on a bound of the prior."""
     if labels.are_drawn:
         return []
     exact = labels.is_measured & ~labels.is_noisy
@@ -203,16 +183,15 @@ def on_bounds(
 def draws_of(labels: Labels, prior: PriorDistribution) -> Tensor:
     r"""Draw from :math:`p(\theta \mid y) \propto p(\theta)\, p(y \mid \theta)`.
 
-    The draws of a label do not depend on the values of other labels.
-
-    Returns:
-        Shape ``(n, S, d)``, with S of 1 if all labels are exact.
-
-    Raises:
-        InvalidInputError: If no parameters inside the prior's support fit a label.
+    The draws of a label, ``(n, S, d)``, do not depend on the values of other labels. S
+    is 1 if all labels are exact.
     """
     if labels.are_drawn:
-        return _shuffled(labels.draws)
+        # In random order, all of them equally often, at least 100 in all.
+        count = labels.draws.shape[1]
+        with seeded(0):
+            rounds = [torch.randperm(count) for _ in range(-(-NUM_DRAWS // count))]
+        return labels.draws[:, torch.cat(rounds).to(labels.draws.device)]
     if labels.are_exact:
         return labels.y[:, None]
     parts = []
@@ -221,14 +200,6 @@ def draws_of(labels: Labels, prior: PriorDistribution) -> Tensor:
         with seeded(number):
             parts.append(_drawn(labels[rows], prior, first=int(rows[0])))
     return torch.cat(parts)
-
-
-def _shuffled(draws: Tensor) -> Tensor:
-    """Return draws in random order, all of them equally often, at least 100 in all."""
-    count = draws.shape[1]
-    with seeded(0):
-        rounds = [torch.randperm(count) for _ in range(-(-NUM_DRAWS // count))]
-    return draws[:, torch.cat(rounds).to(draws.device)]
 
 
 def _drawn(labels: Labels, prior: PriorDistribution, *, first: int) -> Tensor:
@@ -241,15 +212,16 @@ def _drawn(labels: Labels, prior: PriorDistribution, *, first: int) -> Tensor:
     missed = torch.maximum(low - y, y - high) > LARGEST_MISS * std
     lost = torch.isneginf(log_posterior).all(dim=1)
     lost |= (labels.is_noisy & missed).any(dim=1)
-    shares = torch.softmax(log_posterior, dim=1)
-    few = ~labels.is_exact & (1.0 / shares.square().sum(dim=1) < SMALLEST_SIZE)
-    rows = ((lost if lost.any() else few).nonzero().flatten()[:5] + first).tolist()
     if lost.any():
+        rows = (lost.nonzero().flatten()[:5] + first).tolist()
         raise InvalidInputError(
             "Expected labels that some parameters inside the support of the prior "
             f"fit; got {int(lost.sum())} others (first: {rows}). Check the units."
         )
-    if rows:
+    shares = torch.softmax(log_posterior, dim=1)
+    few = ~labels.is_exact & (1.0 / shares.square().sum(dim=1) < SMALLEST_SIZE)
+    if few.any():
+        rows = (few.nonzero().flatten()[:5] + first).tolist()
         warn_user(
             f"The labels {rows} are hardly plausible under the prior: fewer than "
             f"{SMALLEST_SIZE:.0f} effective draws fit."
@@ -306,11 +278,10 @@ def nodes_of(
     r"""Return the nodes at which the densities of labels are computed.
 
     Of labels given as draws, these are the draws, weighted by
-    :math:`1 / p(\theta)`, so that scores are relative to those of the prior.
-
-    Each label has at least ``num_nodes``. The ``references`` are moments of the
-    densities at the observation of each label. Those of the prior are added, and take
-    the place of what is not finite.
+    :math:`1 / p(\theta)`, so that scores are relative to those of the prior. Others
+    have at least ``num_nodes``. The ``references`` are moments of the densities at
+    the observation of each label. Those of the prior are added, and replace what is not
+    finite.
     """
     if labels.are_drawn:
         log_prior = prior.log_prob(labels.draws).double()
@@ -366,10 +337,7 @@ def place_nodes(
     *,
     num_nodes: int,
 ) -> Nodes:
-    """Draw the nodes of labels that are measurements, equally many of each reference.
-
-    Nodes outside the support of the prior get the weight zero.
-    """
+    """Draw nodes of measurements, weighted zero outside the support of the prior."""
     n, d = labels.y.shape
     of_each = max(1, math.ceil(num_nodes / len(references)))
     total = of_each * len(references)
@@ -412,7 +380,7 @@ def place_nodes(
 def _updated(
     labels: Labels, mean: Tensor, covariance: Tensor, measured: Tensor, free: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the mean and a Cholesky factor of the open parameters given the label."""
+    """Return mean and Cholesky factor of the open parameters given the label."""
     scale = covariance.diagonal(dim1=1, dim2=2).clamp_min(1e-300)
     covariance = covariance + JITTER * torch.diag_embed(scale)
     noise = labels.covariance[:, measured][:, :, measured]

@@ -9,7 +9,6 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._prior import PriorDistribution
 from sbi_rope._progress import is_shown
 from sbi_rope._random import seeded
 from sbi_rope._sbi import TrainedNPE, embed
@@ -38,17 +37,13 @@ from sbi_rope.settings import Count, check
 from sbi_rope.simulate import Source, moments, source_of, targets
 from sbi_rope.tensors import as_numbers, check_same_length, column_names, rows_with
 
-__all__ = ["EmbeddedBatch", "RoPE"]
-
 # The number of simulations to couple with if the batch has fewer observations.
 MIN_SIMULATIONS = 1000
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class EmbeddedBatch:
-    r"""The embeddings of real observations and of simulations.
-
-    :meth:`RoPE.embed <sbi_rope.RoPE.embed>` returns it, and it can be coupled.
+    r"""The embeddings of real observations and of simulations, which can be coupled.
 
     Attributes:
         x_o: The observations, shape ``(n_o, *event)``.
@@ -73,23 +68,17 @@ class EmbeddedBatch:
     def posterior(
         self, coupling: Coupling, *, unseen: Literal["raise", "extend"] = "raise"
     ) -> MixturePosterior:
-        """Return the mixture of simulated posteriors that a coupling gives.
-
-        ``unseen`` is that of :meth:`~sbi_rope.RoPE.build_posterior`.
-        """
-        # Each posterior has copies of its own of net and density. Moving one to another
-        # device then leaves the others where they are.
-        net = copy.deepcopy(self.embedding_net)
+        """Return the mixture of simulated posteriors that a coupling gives."""
+        # Copies, so that moving one posterior to a device leaves the others where they
+        # are.
+        net, npe = copy.deepcopy(self.embedding_net), self.npe
         density = Coupled(
-            self.npe.density(), self.simulated, self.x_o, net, coupling, unseen=unseen
+            npe.density(), self.simulated, self.x_o, net, coupling, unseen=unseen
         )
         posterior = MixturePosterior(
-            density,
-            self.npe.prior,
-            enable_transform=self.npe.enable_transform,
+            density, npe.prior, enable_transform=npe.enable_transform
         )
-        posterior.parameter_names = self.npe.parameter_names
-        posterior.x_names = self.npe.x_names
+        posterior.parameter_names, posterior.x_names = npe.parameter_names, npe.x_names
         return posterior
 
 
@@ -98,17 +87,16 @@ class RoPE:
 
     An NPE posterior is :math:`q(\theta \mid h(x))`, trained on simulations. RoPE
 
-    1. tunes a copy g of h so that :math:`g(x_o)` comes close to the embeddings that h
-       gives to simulations with the same parameters (:meth:`train`; needs calibration
-       pairs);
+    1. tunes a copy g of h so that :math:`g(x_o)` comes close to the embeddings by h of
+       simulations with the same parameters (:meth:`train`; needs calibration pairs);
     2. couples a batch of real observations with simulations by optimal transport
        between :math:`g(x_o)` and :math:`h(x_s)`;
     3. returns for each observation the mixture
        :math:`\sum_j \alpha_{ij}\, q(\theta \mid h(x_{s,j}))` (:meth:`build_posterior`
        does steps 2 and 3).
 
-    Without calibration pairs step 1 is left out, and g = h (the paper's "OT-only"). The
-    posterior is copied and never changed.
+    Without calibration pairs, g = h (the paper's "OT-only"). The posterior is copied
+    and never changed.
 
     References:
         | Addressing Misspecification in Simulation-based Inference through Data-driven
@@ -117,28 +105,27 @@ class RoPE:
 
     Args:
         posterior: What ``NPE(...).build_posterior()`` returns, or the posterior of
-            MNPE, FMPE or NPSE (the last two have no ``log_prob``). It must be trained
-            in one round: a posterior of several rounds fits one observation only.
+            MNPE, FMPE or NPSE (these two without ``log_prob``), trained in one round.
         simulator: Maps parameters ``(n, d)`` to simulations ``(n, *event)``, or one
             ``(d,)`` to one ``(*event)``. It may take tensors or NumPy arrays (of
             float64), and return either, lists, or numbers. A row of x may depend on the
-            same row of theta only, with noise drawn anew for each row from the global
-            generator of torch, NumPy or Python. Simulations with NaN or Inf, and those
-            for which the simulator raises, are dropped and counted.
-            :func:`~sbi_rope.parallel` calls it in several processes.
+            same row of theta only, with noise from the global generator of torch, NumPy
+            or Python. Simulations with NaN or Inf, and those for which the simulator
+            raises, are dropped and counted. :func:`~sbi_rope.parallel` calls it in
+            several processes.
         simulations: Instead of a simulator, stored pairs (theta, x) with theta drawn
-            from the prior. Fine-tuning then uses those with the nearest parameters.
-            A warning says if their parameters are not distributed like the prior. If
-            x is a table, later tables of x are put into the order of its columns.
+            from the prior; there is a warning if it is distributed otherwise.
         num_simulations: For a simulator that takes long: how many simulations it makes
-            in all, at draws of the prior, when they are first needed. They are then
-            used as stored simulations are. If None, the simulator is called as often as
-            the steps ask for it, see :attr:`num_simulator_calls`.
+            in all, from the prior, when they are first needed. They are then used as
+            stored ones. If None, see :attr:`num_simulator_calls`.
         finetuner: Settings of step 1; ``CalibrationFinetuner()`` if None.
         coupler: Settings of step 2; ``SinkhornCoupler()`` if None.
-        parameter_names: One name for each parameter, for reports and intervals. If
-            None, the columns of the first table of parameters, or "theta_1" and so on.
-            Tables of parameters are put into the order of these names.
+        parameter_names: One name for each parameter. If None, the columns of the first
+            table of parameters, or "theta_1" and so on.
+
+    Attributes:
+        pairs: The calibration pairs appended so far, with draws of their parameters.
+        source: Where simulations come from.
 
     Raises:
         UnsupportedPosteriorError: If the posterior has no embedding to work with, or
@@ -176,8 +163,10 @@ class RoPE:
         coupler: SinkhornCoupler | None = None,
         parameter_names: Sequence[str] | None = None,
     ) -> None:
-        check("finetuner", finetuner, CalibrationFinetuner | None)
-        check("coupler", coupler, SinkhornCoupler | None)
+        self.finetuner = CalibrationFinetuner() if finetuner is None else finetuner
+        self.coupler = SinkhornCoupler() if coupler is None else coupler
+        check("finetuner", self.finetuner, CalibrationFinetuner)
+        check("coupler", self.coupler, SinkhornCoupler)
         x_names = None
         if simulations is not None:
             theta, x = simulations
@@ -186,7 +175,7 @@ class RoPE:
             simulations = (as_numbers("theta", theta, names=parameter_names), x)
         self._npe = TrainedNPE(posterior, parameter_names)
         self._npe.x_names = x_names
-        self._source: Source = source_of(
+        self.source: Source = source_of(
             self._npe.prior,
             simulator=simulator,
             simulations=simulations,
@@ -195,10 +184,8 @@ class RoPE:
             like=self._npe.like,
             readable=self._npe.readable,
         )
-        self.finetuner = CalibrationFinetuner() if finetuner is None else finetuner
-        self.coupler = SinkhornCoupler() if coupler is None else coupler
         x = self._npe.like.new_empty(0, *self._npe.event_shape)
-        self._pairs = Pairs.exact(self._npe.like, x)
+        self.pairs = Pairs.exact(self._npe.like, x)
         self._names: tuple[Hashable, ...] = ()
         self._g: nn.Module | None = None
         self._prior_is_compared = False
@@ -220,10 +207,9 @@ class RoPE:
         :math:`y \sim \mathcal N(\theta, R)` of some or all of the parameters, and what
         needs the parameters averages over :math:`p(\theta \mid y)` under the prior.
 
-        Tensors, arrays, tables and lists of numbers are taken here and wherever
-        parameters and observations of a user are passed. A table whose columns have the
-        names that RoPE knows is put into their order. The rows of theta and x are
-        paired as they stand, whatever their labels are.
+        Tensors, arrays, tables and lists of numbers are taken wherever a user passes
+        data. A table with the column names that RoPE knows is put into their order.
+        The rows of theta and x are paired as they stand, whatever their row labels are.
 
         Args:
             theta: Parameters, shape ``(n, d)``, inside the prior's support. NaN stands
@@ -236,10 +222,9 @@ class RoPE:
             theta_cov: Instead of ``theta_std``, the covariance of the measurements,
                 shape ``(d, d)`` or ``(n, d, d)``.
             weights: How many pairs each pair counts as, shape ``(n,)``; one if None.
-            groups: A number or a name for each pair, n of them. Pairs with the same
-                are recordings of one person or specimen, also if they were appended by
-                different calls. They are held out together, and count once where they
-                are scored. None if pairs with equal labels are these.
+            groups: A number or a name for each pair. Pairs with the same are recordings
+                of one person or specimen. They are held out together, and count once
+                where they are scored. If None, pairs with equal labels are a group.
 
         Returns:
             Itself, so that calls can be chained.
@@ -283,20 +268,20 @@ class RoPE:
             )
             label, weight, x = label[known], weight[known], x[known]
             of_rows = tuple(itertools.compress(of_rows, known.tolist()))
-        if len(self._pairs) and bool(self._names) != bool(of_rows):
+        if len(self.pairs) and bool(self._names) != bool(of_rows):
             raise InvalidInputError(
                 "Expected `groups` of all calibration pairs, or of none; got some."
             )
-        label, of_rows = self._pairs.label + label, self._names + of_rows
+        label, of_rows = self.pairs.label + label, self._names + of_rows
         group = label.group
         if of_rows:
             numbers = {name: k for k, name in enumerate(dict.fromkeys(of_rows))}
             group = torch.tensor([numbers[name] for name in of_rows]).to(group)
         pairs = Pairs(
             theta=draws_of(label, self._npe.prior),
-            x=torch.cat([self._pairs.x, x]),
+            x=torch.cat([self.pairs.x, x]),
             group=group,
-            weight=torch.cat([self._pairs.weight, weight]),
+            weight=torch.cat([self.pairs.weight, weight]),
             label=label,
         )
         total = float(pairs.weight.sum())
@@ -310,7 +295,7 @@ class RoPE:
                 f"{', '.join(found)} lie exactly on the prior's bound; if they are "
                 "censored, pass theta_std."
             )
-        self._pairs, self._names = pairs, of_rows
+        self.pairs, self._names = pairs, of_rows
         self._npe.parameter_names, self._npe.x_names = names, x_names
         self._g, self._history = None, None
         self._prior_is_compared = False
@@ -323,8 +308,7 @@ class RoPE:
 
         Every call starts from the embedding net of NPE. Where labels are not exact,
         targets are averages given the label and x, under a discrepancy model of the
-        embedding. They take one simulation at each of the draws of a label, whatever
-        ``simulations_per_target`` is.
+        embedding, and take one simulation at each draw of a label.
 
         Args:
             seed: Seed of the simulations and of the hold-out split, for torch, NumPy
@@ -335,11 +319,11 @@ class RoPE:
         Returns:
             Itself, so that calls can be chained.
         """
-        if not len(self._pairs):
+        if not len(self.pairs):
             raise NotReadyError(
                 "No calibration pairs; call `append_calibration(theta, x)` first."
             )
-        show, pairs = is_shown(show_progress_bars), self._pairs
+        show, pairs = is_shown(show_progress_bars), self.pairs
 
         def drawn(count: int) -> Tensor:
             if pairs.are_exact:
@@ -348,7 +332,7 @@ class RoPE:
             return tuning_targets(
                 embed(self._npe.h, pairs.x),
                 moments(
-                    self._source,
+                    self.source,
                     pairs,
                     self.finetuner.simulations_per_target,
                     self._embed_simulations,
@@ -382,12 +366,11 @@ class RoPE:
             show_progress_bars: As in :meth:`train`.
 
         Returns:
-            :math:`E[h(S(\theta)) \mid y_i]`, shape ``(n_c, l)``. Over labels that are
-            not exact it averages the parameters, too.
+            :math:`E[h(S(\theta)) \mid y_i]`, shape ``(n_c, l)``.
         """
         return targets(
-            self._source,
-            self._pairs,
+            self.source,
+            self.pairs,
             simulations_per_target,
             self._embed_simulations,
             num_neighbors=self.finetuner.num_neighbors,
@@ -396,7 +379,7 @@ class RoPE:
 
     def _simulations(self, count: int, *, progress: bool) -> Tensor:
         """Return up to ``count`` simulations from the prior, always the same."""
-        return self._source.from_prior(count, seed=0, progress=progress)[1]
+        return self.source.from_prior(count, seed=0, progress=progress)[1]
 
     def embed(
         self,
@@ -410,15 +393,10 @@ class RoPE:
 
         The arguments are those of :meth:`build_posterior`, which with the same
         ``num_simulations`` and ``seed`` couples with the same simulations.
-
-        Returns:
-            :math:`g(x_o)` (:math:`h(x_o)` without calibration pairs), parameters drawn
-            from the prior, and :math:`h(x_s)` of one simulation at each of them.
-            Simulations that are not finite are left out.
         """
-        if len(self._pairs) and self._g is None:
+        if len(self.pairs) and self._g is None:
             raise NotReadyError(
-                f"{len(self._pairs)} calibration pairs were appended; call `train()` "
+                f"{len(self.pairs)} calibration pairs were appended; call `train()` "
                 "first."
             )
         net = self._npe.h if self._g is None else self._g
@@ -426,19 +404,12 @@ class RoPE:
         real = self._npe.embed("x_o", x_o, net)
         check("num_simulations", num_simulations, Count | None)
         with seeded(seed):
-            theta, simulated = self._source.from_prior(
+            theta, simulated = self.source.from_prior(
                 num_simulations or max(len(x_o), MIN_SIMULATIONS),
                 self._embed_simulations,
                 progress=is_shown(show_progress_bars),
             )
-        return EmbeddedBatch(
-            x_o=x_o,
-            real=real,
-            theta=theta,
-            simulated=simulated,
-            npe=self._npe,
-            embedding_net=net,
-        )
+        return EmbeddedBatch(x_o, real, theta, simulated, self._npe, net)
 
     def build_posterior(
         self,
@@ -454,7 +425,6 @@ class RoPE:
         """Couple a batch of real observations with simulations.
 
         After one training, it can be called for any number of batches and couplers.
-        With the same seed the simulations are the same.
 
         Args:
             x_o: The batch, shape ``(n_o, *event)``. Each posterior depends on the whole
@@ -462,8 +432,7 @@ class RoPE:
             coupler: Settings for this batch; those of this object if None.
             num_simulations: n_s; ``max(n_o, 1000)`` if None. Of stored simulations
                 there may be fewer.
-            seed: Seed of the simulations, for torch, NumPy and Python; None uses their
-                states.
+            seed: Seed of the simulations, as in :meth:`train`.
             unseen: What the posterior does with an x outside the batch: ``"raise"`` an
                 error, or ``"extend"`` the coupling by one row.
             require_convergence: Whether a coupling that has not converged is an error.
@@ -499,11 +468,11 @@ class RoPE:
 
     def _warn_of_prior(self, tau: float) -> None:
         """Warn once if a batch is spread over a prior that the labels do not follow."""
-        if self._prior_is_compared or tau < 1 or not len(self._pairs):
+        if self._prior_is_compared or tau < 1 or not len(self.pairs):
             return
         self._prior_is_compared = True
-        prior = PriorDistribution(self._npe.prior)
-        if is_improbable(found := probability_of_prior(self._pairs, prior)):
+        found = probability_of_prior(self.pairs, self._npe.prior)
+        if is_improbable(found):
             warn_user(
                 "The labels are not distributed like the prior (probability that they "
                 f"are: {found:.1g}), over which tau=1 spreads the batch. Use a smaller "
@@ -513,8 +482,7 @@ class RoPE:
     def tuned_posterior(self) -> Any:
         r"""Return the flow on the tuned embedding, :math:`q(\theta \mid g(x))`.
 
-        It is the paper's ablation without transport ("tuning-only"), and an ordinary
-        sbi posterior for any x.
+        It is an sbi posterior for any x, the paper's ablation "tuning-only".
         """
         return self._npe.posterior(self.tuned_embedding_net)
 
@@ -523,27 +491,14 @@ class RoPE:
         return self._npe.as_x("x_o", x_o)
 
     @property
-    def pairs(self) -> Pairs:
-        """The calibration pairs appended so far, with draws of their parameters."""
-        return self._pairs
-
-    @property
-    def source(self) -> Source:
-        """Where simulations come from."""
-        return self._source
-
-    @property
     def npe(self) -> Any:
         """A copy of the NPE posterior that this object repairs."""
         return self._npe.posterior()
 
     @property
     def calibration(self) -> tuple[Tensor, Tensor]:
-        """The calibration pairs appended so far, theta and x.
-
-        Of labels that are not exact, theta is the mean given the label.
-        """
-        return self._pairs.mean.clone(), self._pairs.x.clone()
+        """The pairs so far, theta (its mean given a label that is not exact) and x."""
+        return self.pairs.mean.clone(), self.pairs.x.clone()
 
     @property
     def parameter_names(self) -> tuple[str, ...] | None:
@@ -582,28 +537,25 @@ class RoPE:
     @property
     def num_dropped_simulations(self) -> int:
         """Number of simulations dropped so far because of NaN or Inf."""
-        return self._source.num_dropped
+        return self.source.num_dropped
 
     @property
     def num_simulator_calls(self) -> int:
         """How many rows of theta the simulator has simulated so far.
 
-        A few are simulated when RoPE is constructed. :meth:`train` simulates 100 for
-        each label (and 2000 with rehearsal), :meth:`build_posterior` ``max(n_o, 1000)``
-        for each batch, and :func:`~sbi_rope.stack` 10,000 from the prior and 100 for
-        each label.
+        A few are simulated when RoPE is constructed, 100 for each label by
+        :meth:`train` (and 2000 with rehearsal), ``max(n_o, 1000)`` for each batch by
+        :meth:`build_posterior`, and by :func:`~sbi_rope.stack` 10,000 from the prior
+        and 100 for each label.
         """
-        return self._source.num_calls
+        return self.source.num_calls
 
     def __repr__(self) -> str:
         name = type(self._npe.estimator).__name__
         state = "trained" if self.is_trained else "not trained"
-        num_pairs, num_groups = len(self._pairs), self._pairs.num_groups
-        pairs = f"{num_pairs} calibration pair{'' if num_pairs == 1 else 's'}"
-        if num_groups < num_pairs:
-            pairs += f" in {num_groups} group{'' if num_groups == 1 else 's'}"
         return (
-            f"RoPE({name}, {pairs}, {state}, "
+            f"RoPE({name}, {len(self.pairs)} calibration pairs in "
+            f"{self.pairs.num_groups} groups, {state}, "
             f"gamma {self.coupler.gamma:g}, tau {self.coupler.tau:g})"
         )
 

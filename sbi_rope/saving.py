@@ -3,17 +3,13 @@
 Torch reads the file with ``weights_only=True``, which allows only what is listed:
 classes that derive from one of our bases and are defined in one of a few packages, and
 a few functions of tensors. None of these imports by name, evaluates text, opens a file
-or unpickles, as for example some networks of ``torch`` do.
-
-Torch calls what is listed with arguments of the file. In the place of a class it
-therefore finds what makes empty objects only. Only distributions and transforms are
-listed themselves, because zuko calls them.
+or unpickles. In the place of a class, torch finds what makes empty objects only, except
+for distributions and transforms, which zuko calls.
 """
 
 import functools
 import importlib
 import pickle
-import threading
 import zipfile
 from collections.abc import Sequence
 from dataclasses import is_dataclass
@@ -33,8 +29,6 @@ from sbi_rope._files import write_atomically
 from sbi_rope._sbi import BasePotential, NeuralPosterior
 from sbi_rope.errors import DataNotFoundError, FileFormatError
 from sbi_rope.settings import check
-
-__all__ = ["load", "save"]
 
 LAWS = (Distribution, Transform)
 BASES = (nn.Module, *LAWS, Constraint, NeuralPosterior, BasePotential)
@@ -72,8 +66,6 @@ METHODS = (
     *("ode_fn", "_f_condition_last", "_identity_weight_fn"),
     *("_max_likelihood_weight_fn", "_variance_weight_fn"),
 )
-# Torch has one list of what files may name, for all threads.
-ONE_AT_A_TIME = threading.RLock()
 
 
 def save(posterior: Any, path: str | Path, *, overwrite: bool = False) -> None:
@@ -118,12 +110,7 @@ def load(path: str | Path, *, trusted: Sequence[Any] = ()) -> Any:
     Args:
         path: The file.
         trusted: Your own classes and functions that the posterior needs, such as the
-            class of an embedding net or prior. Their code may run. What was passed to
-            ``torch.serialization.add_safe_globals`` is trusted, too.
-
-    Returns:
-        The posterior. Samples with a seed and densities are those of the posterior that
-        was saved.
+            class of an embedding net or prior. Their code may run.
 
     Raises:
         FileFormatError: If it is not a file of :func:`save`, is damaged, was written by
@@ -163,27 +150,26 @@ def _content(path: Path, known: dict[str, Any]) -> Any:
     with zipfile.ZipFile(path) as archive:
         if archive.testzip() is not None:  # torch does not compare check sums
             raise ValueError("a check sum is wrong")
-    with ONE_AT_A_TIME:
-        names = get_unsafe_globals_in_checkpoint(path)
-        needed = {name: known.get(name) or _found(name) for name in names}
-        if unknown := sorted(name for name in names if needed[name] is None):
-            classes = ", ".join(name.rpartition(".")[2] for name in unknown)
-            raise FileFormatError(
-                f"{path} needs {', '.join(unknown)}, which could run anything. If you "
-                f"trust its author, import it and pass `trusted=[{classes}]`."
-            )
-        allowed: list[Any] = []
-        for name, value in needed.items():
-            is_called = name in known or _may_be_called(value)
-            allowed.append((value if is_called else _Maker(value), name))
-            # Torch fills objects only if their class is listed. No file can name this.
-            allowed.append((value, f"{name}\n"))
-        with safe_globals(allowed):
-            return torch.load(path, map_location="cpu", weights_only=True)
+    names = get_unsafe_globals_in_checkpoint(path)
+    needed = {name: known.get(name) or _found(name) for name in names}
+    if unknown := sorted(name for name in names if needed[name] is None):
+        classes = ", ".join(name.rpartition(".")[2] for name in unknown)
+        raise FileFormatError(
+            f"{path} needs {', '.join(unknown)}, which could run anything. If you "
+            f"trust its author, import it and pass `trusted=[{classes}]`."
+        )
+    allowed: list[Any] = []
+    for name, value in needed.items():
+        is_called = name in known or _may_be_called(value)
+        allowed.append((value if is_called else _Maker(value), name))
+        # Torch fills objects only if their class is listed. No file can name this.
+        allowed.append((value, f"{name}\n"))
+    with safe_globals(allowed):
+        return torch.load(path, map_location="cpu", weights_only=True)
 
 
 class _Pickler(pickle.Pickler):
-    """Writes what NumPy holds as tensors, because its own pickles name functions."""
+    """Writes arrays as tensors, because the pickles of NumPy name functions."""
 
     def reducer_override(self, obj: Any) -> Any:
         if isinstance(obj, np.ndarray | np.number | np.bool_):
@@ -250,7 +236,6 @@ class _Maker:
 
 
 def _versions() -> dict[str, str]:
-    """Return the versions whose classes have the same attributes."""
     ours = importlib.import_module("sbi_rope").__version__
     versions = {"sbi": sbi.__version__, "sbi_rope": ours}
     return {name: ".".join(v.split(".")[:2]) for name, v in versions.items()}

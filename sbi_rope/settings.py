@@ -9,23 +9,6 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 from sbi_rope.errors import InvalidInputError, shown
 
-__all__ = [
-    "Count",
-    "Level",
-    "NotNegative",
-    "Number",
-    "Positive",
-    "Range",
-    "Seed",
-    "Settings",
-    "UnitInterval",
-    "Whole",
-    "check",
-    "default_names",
-    "names_of",
-    "one_of",
-]
-
 
 @dataclass(frozen=True)
 class Range:

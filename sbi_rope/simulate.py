@@ -1,13 +1,10 @@
-"""Sources of simulations, and what simulations at the labels of pairs are like.
-
-A source is a user's simulator, or pairs (theta, x) that were stored.
-"""
+"""Sources of simulations, and what simulations at the labels of pairs are like."""
 
 import itertools
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import joblib
 import torch
@@ -23,26 +20,11 @@ from sbi_rope.errors import InvalidInputError, SimulationError, warn_user
 from sbi_rope.settings import Count, check
 from sbi_rope.tensors import as_batch, as_numbers, check_in_support
 
-__all__ = [
-    "Moments",
-    "ParallelSimulator",
-    "Simulated",
-    "Source",
-    "Stored",
-    "all_finite",
-    "draws",
-    "moments",
-    "parallel",
-    "source_of",
-    "targets",
-]
-
 Embed = Callable[[Tensor], Tensor]
 # Tells which simulations an embedding net can read, ``(n, *event)`` to ``(n,)``.
 Readable = Callable[[Tensor], Tensor]
-# Simulations ``(n, *event)`` with NaN where the simulator raised, the number of rows
-# that were simulated for them, and the first error.
-Result = tuple[Tensor, int, Exception | None]
+# Simulations ``(n, *event)`` with NaN where the simulator raised, and its first error.
+Result = tuple[Tensor, Exception | None]
 
 # A simulator may fail at some parameters, so that it is tried at so many.
 TRIES = 5
@@ -93,21 +75,14 @@ def parallel(
 ) -> ParallelSimulator:
     """Return a simulator whose rows are simulated in several processes at once.
 
-    Pass what it returns as ``simulator``. Each worker of joblib gets one theta at a
-    time, or a hundred rows if the simulator takes batches. It pays if a call takes
-    longer than about a millisecond.
-
-    Every piece has a seed of its own, so that simulations are the same for any
-    ``num_workers``, but others than without ``parallel``. A generator of the simulator
-    itself must be made inside of it, with a seed from a global generator:
-    ``rng = np.random.default_rng(np.random.randint(2**31))``. Otherwise all workers may
-    repeat the same noise.
+    It pays if a call takes longer than about a millisecond. Simulations are the same
+    for any ``num_workers``, but others than without ``parallel``. Seed a generator of
+    your own inside the simulator from a global one, or all workers may repeat the same
+    noise: ``rng = np.random.default_rng(np.random.randint(2**31))``.
 
     Args:
-        simulator: As RoPE takes it, batched or not, of tensors or NumPy arrays. It may
-            be a lambda.
-        num_workers: The number of processes. With 1 everything is simulated in this
-            one.
+        simulator: As RoPE takes it. It may be a lambda.
+        num_workers: The number of processes. With 1 all is simulated in this one.
 
     Example:
         >>> import numpy as np
@@ -127,7 +102,7 @@ class _Way:
 
     function: Callable[[Any], Any]
     batched: bool
-    kind: Literal["tensor to tensor", "array", "tensor"]
+    kind: str
     event_shape: torch.Size
     like: Tensor
 
@@ -152,38 +127,32 @@ class _Way:
 
     def simulate(self, theta: Tensor) -> Result:
         """Simulate theta ``(n, d)``; if a batch raises, its rows one by one."""
-        error, num_calls, rows = None, len(theta), []
+        error, rows = None, []
         if self.batched:
             try:
-                return self.x_of(theta), num_calls, None
+                return self.x_of(theta), None
             except Exception as raised:  # of any type
-                error, num_calls = raised, 2 * num_calls
+                error = raised
         for one in theta.split(1) if self.batched else theta:
             try:
-                x = self.x_of(one).reshape(self.event_shape)
+                rows.append(self.x_of(one).reshape(self.event_shape))
             except Exception as raised:
                 error = error or raised
-                x = self.like.new_full(self.event_shape, torch.nan)
-            rows.append(x)
-        return torch.stack(rows), num_calls, error
+                rows.append(self.like.new_full(self.event_shape, torch.nan))
+        return torch.stack(rows), error
 
     def simulate_in_worker(self, theta: Tensor, seed: int) -> Result:
         """Simulate, and return an error that can be sent to another process."""
         with seeded(seed):
-            x, num_calls, error = self.simulate(theta)
-        named = error and SimulationError(f"{type(error).__name__}: {error}")
-        return x, num_calls, named
+            x, error = self.simulate(theta)
+        return x, error and SimulationError(f"{type(error).__name__}: {error}")
 
 
 class Simulated:
     """A user's simulator, called in the first way in which it returns the right shape.
 
-    Simulations that are not ``readable`` are left out, counted and warned of. Those
-    that are have the ``event_shape``, and the dtype and device of ``like``.
-
-    Attributes:
-        num_calls: How many rows were simulated so far.
-        num_dropped: How many simulations were left out so far.
+    Simulations that are not ``readable`` are dropped, counted and warned of. The others
+    have the ``event_shape``, and the dtype and device of ``like``.
     """
 
     def __init__(
@@ -218,37 +187,25 @@ class Simulated:
         *,
         seed: int | None = None,
         progress: bool = False,
+        finished: list[Result] | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Return n parameters from the prior, and embeddings of their simulations.
 
-        With a seed they are simulated once and kept, as many as memory allows.
+        With a seed they are simulated once and kept, as many as memory allows. Parts
+        that are ``finished`` are not simulated again, and others are added to them.
         """
         if seed is None:
-            return self.drawn(n, embed, progress=progress)
+            theta = self._prior.sample(torch.Size((n,))).to(self._like)
+            embedded, ok = self._embedded(
+                theta, embed, "from the prior", progress=progress, finished=finished
+            )
+            return theta[ok], embedded[ok]
         n = min(n, max(1, MAX_KEPT // self._event_shape.numel()))
         if (n, seed) not in self._kept:
             with seeded(seed):
-                self._kept[n, seed] = self.drawn(n, _itself, progress=progress)
+                self._kept[n, seed] = self.from_prior(n, progress=progress)
         theta, x = self._kept[n, seed]
         return theta, embed(x)
-
-    def drawn(
-        self,
-        n: int,
-        embed: Embed,
-        *,
-        finished: list[Result] | None = None,
-        progress: bool,
-    ) -> tuple[Tensor, Tensor]:
-        """Simulate at n draws; parts that are finished are not simulated again.
-
-        Other parts are added to those that are finished.
-        """
-        theta = self._prior.sample(torch.Size((n,))).to(self._like)
-        embedded, valid = self._embedded(
-            theta, embed, "from the prior", progress=progress, finished=finished
-        )
-        return theta[valid], embedded[valid]
 
     def at(self, theta: Tensor, embed: Embed, *, progress: bool = False) -> Tensor:
         """Simulate at parameters of n pairs, ``(n, S, d)`` to ``(n, S, l)``.
@@ -271,36 +228,30 @@ class Simulated:
         return embedded.reshape(*theta.shape[:2], -1)
 
     def _working_way(self, function: Callable[[Any], Any]) -> _Way:
-        """Try batches before single parameters, and tensors before arrays.
-
-        A simulator that makes something else than a tensor from tensors is given arrays
-        if it takes them, because it was written for these. One that was written for a
-        single theta may take a batch, and add the same noise to all rows.
-        """
+        """Try batches before single parameters, and tensors before arrays."""
         sizes = {*self._prior.event_shape, *self._event_shape}
         # A number of rows that is no number of parameters or of readings.
         num_rows = next(n for n in range(3, 4 + len(sizes)) if n not in sizes)
         kinds = ("tensor to tensor", "array", "tensor")
+        thetas = self._prior.sample(torch.Size((TRIES,))).to(self._like)
         errors: dict[Any, Exception] = {}
-        for theta in self._prior.sample(torch.Size((TRIES,))).to(self._like):
-            for batched, kind in itertools.product((True, False), kinds):
-                way = _Way(function, batched, kind, self._event_shape, self._like)
-                given = theta.repeat(num_rows, 1) if batched else theta
-                rows = num_rows if batched else 1
-                self.num_calls += rows
-                try:
-                    with warnings.catch_warnings():
-                        # NumPy warns of tensors, which may not be the right way.
-                        warnings.simplefilter("ignore")
-                        x = way.x_of(given)
-                        if batched and bool((x == x[0]).all()):
-                            self.num_calls += rows
-                            if not torch.equal(way.simulate(given)[0], x):
-                                raise SimulationError("All rows have the same noise.")
-                except Exception as raised:  # any error of the user's code
-                    errors[batched, kind] = raised
-                    continue
+        for theta, batched, kind in itertools.product(thetas, (True, False), kinds):
+            way = _Way(function, batched, kind, self._event_shape, self._like)
+            given = theta.repeat(num_rows, 1) if batched else theta
+            rows = num_rows if batched else 1
+            self.num_calls += rows
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")  # NumPy warns of tensors
+                    x = way.x_of(given)
+                    if batched and bool((x == x[0]).all()):
+                        self.num_calls += rows
+                        # Written for one theta, it may add one noise to all rows.
+                        if not torch.equal(way.simulate(given)[0], x):
+                            raise SimulationError("All rows have the same noise.")
                 return way
+            except Exception as raised:  # any error of the user's code
+                errors[batched, kind] = raised
         of_array = errors[False, "array"]
         raise SimulationError(
             "Expected `simulator` to map theta (n, d) to x (n, *event), or one (d,) to "
@@ -321,62 +272,66 @@ class Simulated:
         embeddings, valid, error = [], [], None
         chunk = PARALLEL_CHUNK if self._num_workers else SINGLE_CHUNK
         parts = theta.split(BATCHED_CHUNK if self._way.batched else chunk)
+        label = f"Calling the simulator {len(theta):,} times"
         with progress_bar(
-            show=progress,
-            desc=f"Calling the simulator {len(theta):,} times",
-            total=len(theta),
-            delay=DELAY,
+            show=progress, desc=label, total=len(theta), delay=DELAY
         ) as bar:
             for number, part in enumerate(parts):
                 if finished is None:
-                    x, _, raised = self._simulate(part)
+                    x, raised = self._simulate(part)
                 else:
+                    # With a seed of its own, no part depends on where a call was
+                    # interrupted. Seed 0 is that of theta.
                     if number == len(finished):
-                        # With a seed of its own, no part depends on where a call was
-                        # interrupted. Seed 0 is that of theta.
                         with seeded(number + 1):
                             finished.append(self._simulate(part))
-                    x, _, raised = finished[number]
+                    x, raised = finished[number]
                 bar.update(len(part))
                 error = error or raised
                 ok = self._readable(x)
                 # Embedding nets may raise on NaN. They get zeros instead.
                 embedded = embed(x.where(ok.reshape(-1, *[1] * (x.ndim - 1)), 0.0))
                 embeddings.append(embedded)
-                # An embedding can overflow where x does not. Simulations with missing
-                # entries were embedded when it was found out that they can be read.
+                # An embedding can overflow where x does not. Missing entries that the
+                # net can read are fine.
                 valid.append(ok & (all_finite(embedded) | ~all_finite(x)))
         ok = torch.cat(valid)
-        dropped = int((~ok).sum())
-        self.num_dropped += dropped
         because = "" if error is None else f" The simulator raised {error!r}."
-        if dropped == len(ok):
+        if not ok.any():
             raise SimulationError(
-                f"All {dropped} simulations {where} are not finite.{because}"
+                f"All {len(ok)} simulations {where} are not finite.{because}"
             ) from error
-        if dropped:
-            warn_user(
-                f"Dropped {dropped} of {len(ok)} simulations {where} "
-                f"({dropped / len(ok):.1%}), which are not finite.{because}"
-            )
+        self.num_dropped += _warn_of_dropped(ok, f"simulations {where}", because)
         return torch.cat(embeddings), ok
 
     def _simulate(self, theta: Tensor) -> Result:
         """Simulate rows, in this process or in workers, and count them."""
+        pieces = [theta]
         if self._num_workers is None:
             results = [self._way.simulate(theta)]
         else:
             pieces = theta.split(ROWS_OF_WORKER if self._way.batched else 1)
             seeds = torch.randint(2**31, (len(pieces),)).tolist()
-            # A seeded block waits for those of other threads, so that these do not do.
             run: Any = joblib.Parallel(n_jobs=self._num_workers, backend="loky")
             results = run(
                 joblib.delayed(self._way.simulate_in_worker)(piece, seed)
                 for piece, seed in zip(pieces, seeds, strict=True)
             )
-        xs, num_calls, errors = zip(*results, strict=True)
-        self.num_calls += sum(num_calls)
-        return torch.cat(xs), sum(num_calls), next(filter(None, errors), None)
+        for piece, (_, error) in zip(pieces, results, strict=True):
+            again = self._way.batched and error is not None
+            self.num_calls += len(piece) * (2 if again else 1)
+        xs, errors = zip(*results, strict=True)
+        return torch.cat(xs), next(filter(None, errors), None)
+
+
+def _warn_of_dropped(ok: Tensor, what: str, because: str = "") -> int:
+    """Warn of simulations that are not finite, and return their number."""
+    if dropped := int((~ok).sum()):
+        warn_user(
+            f"Dropped {dropped} of {len(ok)} {what} ({dropped / len(ok):.1%}), which "
+            f"are not finite.{because}"
+        )
+    return dropped
 
 
 # Stored simulations -------------------------------------------------------------------
@@ -385,31 +340,10 @@ class Simulated:
 class Stored:
     """Stored pairs of theta ``(N, d)`` from the prior and x ``(N, *event)``."""
 
+    num_calls = num_dropped = 0
+
     def __init__(self, theta: Tensor, x: Tensor) -> None:
         self._pairs: tuple[Tensor, Tensor] | None = (theta, x)
-        self._dropped = 0
-        self._budget: tuple[Simulated, int] | None = None
-        self._finished: list[Result] = []
-
-    @classmethod
-    def made_by(cls, simulated: Simulated, n: int) -> "Stored":
-        """Return n simulations from the prior that are made when first needed.
-
-        If that is interrupted, the next call goes on where it was.
-        """
-        stored = cls(torch.empty(0), torch.empty(0))
-        stored._pairs, stored._budget = None, (simulated, n)
-        return stored
-
-    @property
-    def num_calls(self) -> int:
-        """How many rows the simulator has simulated, if there is one."""
-        return 0 if self._budget is None else self._budget[0].num_calls
-
-    @property
-    def num_dropped(self) -> int:
-        """How many simulations were not finite."""
-        return self._dropped if self._budget is None else self._budget[0].num_dropped
 
     def from_prior(
         self,
@@ -476,13 +410,34 @@ class Stored:
         return embed(x[rows.flatten()]).reshape(*rows.shape, -1)
 
     def _all(self, *, progress: bool) -> tuple[Tensor, Tensor]:
+        assert self._pairs is not None
+        return self._pairs
+
+
+class Budget(Stored):
+    """Simulations from the prior, made when first needed, then used as stored ones."""
+
+    def __init__(self, simulated: Simulated, n: int) -> None:
+        self._simulated, self._n, self._pairs = simulated, n, None
+        # If that is interrupted, the next call goes on where it was.
+        self._finished: list[Result] = []
+
+    @property
+    def num_calls(self) -> int:  # type: ignore[override]
+        """How many rows were simulated so far."""
+        return self._simulated.num_calls
+
+    @property
+    def num_dropped(self) -> int:  # type: ignore[override]
+        """How many simulations were not finite."""
+        return self._simulated.num_dropped
+
+    def _all(self, *, progress: bool) -> tuple[Tensor, Tensor]:
         if self._pairs is None:
-            assert self._budget is not None
-            simulated, n = self._budget
             # With a seed of their own, they do not depend on who asks first.
             with seeded(0):
-                self._pairs = simulated.drawn(
-                    n, _itself, finished=self._finished, progress=progress
+                self._pairs = self._simulated.from_prior(
+                    self._n, finished=self._finished, progress=progress
                 )
             self._finished = []
         return self._pairs
@@ -527,9 +482,7 @@ def source_of(
         source = Simulated(
             simulator, prior, event_shape=event_shape, like=like, readable=readable
         )
-        if num_simulations is None:
-            return source
-        return Stored.made_by(source, num_simulations)
+        return source if num_simulations is None else Budget(source, num_simulations)
     if num_simulations is not None:
         raise InvalidInputError("Expected `num_simulations` with a simulator only.")
     theta, x = simulations
@@ -540,23 +493,15 @@ def source_of(
     valid = torch.isfinite(theta).all(dim=1) & readable(x)
     if not valid.any():
         raise SimulationError("All stored simulations contain NaN or Inf.")
-    stored = Stored(theta[valid], x[valid])
-    stored._dropped = int((~valid).sum())
-    if stored.num_dropped:
-        warn_user(
-            f"Dropped {stored.num_dropped} of {len(valid)} stored simulations "
-            f"({stored.num_dropped / len(valid):.1%}), which are not finite."
-        )
-    check_in_support("simulations[0]", theta[valid], prior)
+    theta, x = theta[valid], x[valid]
+    stored = Stored(theta, x)
+    stored.num_dropped = _warn_of_dropped(valid, "stored simulations")
+    check_in_support("simulations[0]", theta, prior)
     with seeded(0):
         drawn = prior.sample(torch.Size((NUM_FROM_PRIOR,)))
-    unlike = [
-        number
-        for number, column in enumerate(theta[valid].T.cpu().numpy())
-        if kstest(column, drawn[:, number].cpu().numpy(), method="asymp").pvalue
-        < NOT_FROM_PRIOR
-    ]
-    if unlike:
+    columns = zip(theta.T.cpu().numpy(), drawn.T.cpu().numpy(), strict=True)
+    p_values = [kstest(*both, method="asymp").pvalue for both in columns]
+    if unlike := [k for k, p in enumerate(p_values) if p < NOT_FROM_PRIOR]:
         warn_user(
             f"The parameters {unlike} of `simulations` (counted from 0) are not "
             "distributed like the prior, as whose draws they are used."
@@ -647,14 +592,12 @@ def moments(
     r"""Return the moments of simulations at the parameters of each pair.
 
     At exact parameters these are the moments of ``count`` simulations. Otherwise one
-    simulation is made at each draw that the label leaves possible, and a surface is
-    fitted to the simulations of each label, linear or, with enough draws, quadratic.
-    Its values at the draws are the possible means. The covariance is that of the
-    residuals.
+    simulation is made at each draw of a label, and a surface is fitted to them, linear
+    or, with enough draws, quadratic. Its values at the draws are the possible means.
+    The covariance is that of the residuals.
 
     A surface also fits the noise of the simulations. Its linear and its quadratic terms
-    are shrunk by how much of their size is noise, as James and Stein did, so that
-    labels that are nearly exact have a single possible mean.
+    are shrunk by how much of their size is noise, as James and Stein did.
 
     References:
         | Estimation with Quadratic Loss (James and Stein, 1961)
@@ -675,7 +618,9 @@ def moments(
     noise = covariance.mean(dim=0).diagonal()
     means = level
     for fitted, used in fits:
-        means = means + _shrunk(fitted, used[:, None] * noise)
+        squares = fitted.square().sum(dim=1)
+        kept = 1 - used[:, None] * noise / squares.clamp_min(1e-300)
+        means = means + fitted * kept.clamp_min(0.0)[:, None]
     return Moments(means=means, covariance=covariance)
 
 
@@ -700,18 +645,8 @@ def _features(theta: Tensor) -> list[Tensor]:
 
 
 def _regressed(y: Tensor, terms: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the part of y that is linear in some terms, and how many were fitted.
-
-    Shapes ``(n, R, l)`` and ``(n, R, p)`` to ``(n, R, l)`` and ``(n,)``.
-    """
+    """Return the part of y linear in terms, and how many were fitted, ``(n,)``."""
     ridge = RIDGE * terms.shape[1] * torch.eye(terms.shape[2]).to(terms)
     normal = terms.mT @ terms
     used = torch.linalg.solve(normal + ridge, normal).diagonal(dim1=1, dim2=2)
     return terms @ torch.linalg.solve(normal + ridge, terms.mT @ y), used.sum(dim=1)
-
-
-def _shrunk(fitted: Tensor, noise: Tensor) -> Tensor:
-    """Shrink a fit ``(n, R, l)`` by the noise in its sum of squares, ``(n, l)``."""
-    squares = fitted.square().sum(dim=1)
-    shares = 1 - noise / squares.clamp_min(1e-300)
-    return fitted * shares.clamp_min(0.0)[:, None]

@@ -1,6 +1,5 @@
 """The one place where data of a user become tensors, and are checked."""
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,15 +9,6 @@ from torch import Tensor
 
 from sbi_rope._prior import PriorDistribution
 from sbi_rope.errors import InvalidInputError
-
-__all__ = [
-    "as_batch",
-    "as_numbers",
-    "check_in_support",
-    "check_same_length",
-    "column_names",
-    "rows_with",
-]
 
 
 def as_batch(
@@ -34,6 +24,9 @@ def as_batch(
 ) -> Tensor:
     """Return a user's data as a tensor of shape ``(n, *event_shape)``.
 
+    It has no gradients. A floating-point tensor keeps its dtype, and all else becomes
+    float32.
+
     Args:
         name: What the argument is called.
         value: A tensor, an array, a table, or a list of numbers.
@@ -41,13 +34,8 @@ def as_batch(
         rows: The number of rows; any if None.
         device: Where the tensor has to be, and where arrays and lists are moved.
         names: Names of columns. A table that has them in another order is put in order.
-        finite: Whether NaN and Inf are errors. An array or a list becomes float32, in
-            which numbers beyond 3e38 are infinite.
+        finite: Whether NaN and Inf are errors.
         empty: Whether n may be 0.
-
-    Returns:
-        A tensor without gradients. A floating-point tensor keeps its dtype, and all
-        else becomes float32.
     """
     numbers = as_numbers(name, value, device=device, names=names)
     shape = tuple(numbers.shape)
@@ -56,7 +44,7 @@ def as_batch(
         sizes = ", ".join(map(str, ("n" if rows is None else rows, *event)))
         raise InvalidInputError(
             f"Expected `{name}` of shape ({sizes}{'' if event else ','}); got {shape}."
-            + _hint(name, shape, event)
+            + (f" For a single row pass `{name}[None]`." if shape == event else "")
         )
     if not (empty or shape[0]) or 0 in shape[1:]:
         raise InvalidInputError(
@@ -140,15 +128,3 @@ def rows_with(bad: Tensor) -> str:
     rows = bad.flatten(1).any(dim=1) if bad.ndim > 1 else bad.reshape(-1)
     first = rows.nonzero().flatten()[:5].tolist()
     return f"{int(rows.sum())} of {rows.numel()} rows (first: {first})"
-
-
-def _hint(name: str, shape: tuple[int, ...], event: tuple[int, ...]) -> str:
-    """Say which call makes the batch fit; nothing if that is not known."""
-    if shape == event:
-        return f" For a single row pass `{name}[None]`."
-    if len(shape) == 1 and event == (1,):
-        return f" For one number in each row pass `{name}[:, None]`."
-    if event != shape[1:] and event and math.prod(shape[1:]) == math.prod(event):
-        sizes = ", ".join(map(str, event))
-        return f" If the order of the entries fits, pass `{name}.reshape(-1, {sizes})`."
-    return ""

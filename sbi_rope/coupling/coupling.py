@@ -19,8 +19,6 @@ from sbi_rope.errors import CouplingError, warn_user
 from sbi_rope.settings import Count, Positive, Settings, UnitInterval
 from sbi_rope.tensors import as_batch
 
-__all__ = ["Coupling", "SinkhornCoupler"]
-
 # With fewer observations than this, few of them decide how the coupling is balanced.
 SMALL_BATCH = 20
 # The largest number of distances to store: 0.4 GB in float64, and as much again for the
@@ -28,25 +26,22 @@ SMALL_BATCH = 20
 MAX_STORED = 50_000_000
 # The median distance is computed from this many simulations at most.
 MAX_FOR_MEDIAN = 2000
-# If exponents C / gamma are larger than this, rounding hides the differences between
-# them.
-LARGEST_EXPONENT = 1e12
-# If distances / gamma are larger than this, the rounding of a matrix product would show
-# in the weights.
-LARGEST_BY_PRODUCT = 1e3
+# Exponents C / gamma above this differ by no more than rounding, and above the second
+# number the rounding of a matrix product would show in the weights.
+LARGEST_EXPONENT, LARGEST_BY_PRODUCT = 1e12, 1e3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Coupling:
     r"""The weights of the simulations for each real observation.
 
-    Row i holds the mixture weights of observation i (RoPE, eq. 5). They are a softmax
-    of the simulation-side log-potential :math:`w`,
+    Row i holds the mixture weights of observation i (RoPE, eq. 5), a softmax of the
+    simulation-side log-potential :math:`w`,
 
-    .. math:: \alpha_{ij} = \operatorname{softmax}_j (w_j - C_{ij} / \gamma),
+    .. math:: \alpha_{ij} = \operatorname{softmax}_j (w_j - C_{ij} / \gamma).
 
-    so the rows always sum to one, also if :math:`w` has not converged. The coupling
-    keeps :math:`w` and the embeddings, and computes rows whenever they are asked for.
+    The coupling keeps :math:`w` and the embeddings, and computes rows when they are
+    asked for.
 
     Attributes:
         potential: :math:`w`, shape ``(n_s,)``, float64, with mean zero.
@@ -56,15 +51,14 @@ class Coupling:
             ``cost_scale``.
         tau: The trust in the prior.
         marginal_error: :math:`\lVert q - q^*(w) \rVert_1`, where :math:`q` is the mean
-            of the rows, and :math:`q^*_j \propto b_j e^{-w_j (1 - \tau) / \tau}` is
-            what it should be by the optimality conditions. It is 0 at a
-            solution and at most 2.
+            of the rows, and :math:`q^*_j \propto b_j e^{-w_j (1 - \tau) / \tau}` at the
+            optimum.
         num_iterations: Sinkhorn iterations, over all solvers that were used.
         converged: Whether ``marginal_error`` reached the tolerance.
         solver: The solver that finished: ``"own"``, ``"pot"``, or ``"none"`` at tau =
             0, which needs no iteration.
-        direct: Whether distances are computed without a matrix product. It is needed if
-            gamma is small compared to them.
+        direct: Whether distances are computed without a matrix product, because gamma
+            is small compared to them.
     """
 
     potential: Tensor = field(repr=False)
@@ -98,10 +92,8 @@ class Coupling:
     def rows(self, real: Tensor) -> Tensor:
         r"""Return the weights of other observations under the same potential.
 
-        If the effective sample size of a new row is large, the row is nearly what
-        coupling again would give. If it is only a few, it is not. For observations of
-        the batch, as in ``coupling.rows(coupling.real[10:20])``, the result is their
-        rows of ``weights``.
+        A new row is nearly what coupling again would give if its effective sample size
+        is large, not if it is only a few.
 
         Args:
             real: Embeddings of the observations, shape ``(n, l)``.
@@ -114,12 +106,8 @@ class Coupling:
 
     def to(self, device: str | torch.device) -> "Coupling":
         """Return the same coupling on another device."""
-        return replace(
-            self,
-            potential=self.potential.to(device),
-            real=self.real.to(device),
-            simulated=self.simulated.to(device),
-        )
+        names = ("potential", "real", "simulated")
+        return replace(self, **{name: getattr(self, name).to(device) for name in names})
 
     def _rows(self, real: Tensor) -> Tensor:
         weights = real.new_empty(len(real), len(self.simulated))
@@ -149,8 +137,7 @@ class SinkhornCoupler(Settings):
         \qquad \rho = \frac{\gamma \tau}{1 - \tau},
 
     and returns the rows :math:`\alpha_{ij} = n_o P^\star_{ij}`. Every real observation
-    has the same weight. With ``tau < 1``, some simulations may have less weight than
-    others.
+    has the same weight; with ``tau < 1`` simulations need not.
 
     References:
         | Addressing Misspecification in Simulation-based Inference through Data-driven
@@ -159,18 +146,16 @@ class SinkhornCoupler(Settings):
 
     Args:
         gamma: Entropic regularisation, positive. A small value gives sharp posteriors,
-            and a large one gives the prior. Its unit is that of ``cost_scale``. The
-            paper's value is 0.5 with ``cost_scale="none"``.
-        tau: Trust in the prior, in [0, 1]. With 1 (the default) all simulations are
-            used equally, which is right if the prior is well specified. With 0 every
-            observation chooses its simulations without regard to the others.
-        cost_scale: ``"simulated"`` (the default) divides the distances by the median
-            distance between simulated embeddings, so that a gamma means the same
-            whatever the units of the embedding net. ``"none"`` takes the distances as
-            they are, as the paper does.
-        solver: ``"own"`` (the default) iterates the simulation-side potential with
-            Anderson acceleration. ``"pot"`` is POT's ``sinkhorn_unbalanced``; our own
-            solver takes over where its scalings over- or underflow.
+            and a large one gives the prior. The paper's value is 0.5 with
+            ``cost_scale="none"``.
+        tau: Trust in the prior, in [0, 1]. With 1 all simulations are used equally.
+            With 0 every observation chooses simulations without regard to the others.
+        cost_scale: ``"simulated"`` divides the distances by the median distance between
+            simulated embeddings, so that gamma does not depend on their units.
+            ``"none"`` takes the distances as they are, as the paper does.
+        solver: ``"own"`` iterates the simulation-side potential with Anderson
+            acceleration. ``"pot"`` is POT's ``sinkhorn_unbalanced``; our own solver
+            takes over where its scalings over- or underflow.
         tolerance: The largest ``marginal_error`` that counts as converged.
         max_iterations: The largest number of iterations. If they are not enough,
             ``converged`` is False.
@@ -199,10 +184,6 @@ class SinkhornCoupler(Settings):
         Args:
             real: :math:`g(x_o)`, shape ``(n_o, l)``.
             simulated: :math:`h(x_s)`, shape ``(n_s, l)``; n_s may differ from n_o.
-
-        Returns:
-            The coupling, on the device of the embeddings. Its ``converged`` is False if
-            the tolerance was not met.
 
         Raises:
             CouplingError: If gamma is too small for the digits of float64, or with

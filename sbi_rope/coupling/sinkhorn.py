@@ -18,21 +18,11 @@ tau < 1 it is a contraction in the supremum norm with factor tau.
 import math
 import warnings
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import ot
 import torch
 from torch import Tensor
-
-__all__ = [
-    "Distances",
-    "Kernel",
-    "Solution",
-    "marginal_error",
-    "row_blocks",
-    "solve_fixed_point",
-    "solve_pot",
-]
 
 # Entries of a block: few enough for the caches of a CPU core, and enough to occupy a
 # GPU. Blocks also bound the memory of everything that is not stored.
@@ -77,10 +67,8 @@ class Distances:
     They are computed by one matrix product, :math:`\lVert a - b \rVert^2 = \lVert a
     \rVert^2 + \lVert b \rVert^2 - 2 a^\top b`, relative to the centre of the fixed
     points and in float64. For points at R from the centre, a distance d then has an
-    error of about 1e-16 R^2 / d, and the distance of equal points one of 1e-8 R. That
-    is less than the rounding of a network's embeddings in float32. Where it is not
-    enough, ``direct`` sums squared differences, which takes 1.4 times as long in ten
-    dimensions and 7 times as long in 64.
+    error of about 1e-16 R^2 / d, and the distance of equal points one of 1e-8 R. Where
+    that is not enough, ``direct`` sums squared differences, which takes longer.
 
     Args:
         points: The fixed points, shape ``(n_s, l)``; the distances have their dtype.
@@ -214,7 +202,7 @@ def marginal_error(log_q: Tensor, potential: Tensor, tau: float) -> float:
 
 
 class Solution(NamedTuple):
-    """A potential, its marginal error, and the iterations it took."""
+    """The best potential, with mean zero, its marginal error, and the iterations."""
 
     potential: Tensor
     marginal_error: float
@@ -243,10 +231,6 @@ def solve_fixed_point(
         tau: The trust in the prior, in (0, 1].
         tolerance: The marginal error to reach.
         max_iterations: The largest number of evaluations of the kernel.
-
-    Returns:
-        The potential with the smallest error, shifted to mean zero, its error, and the
-        number of evaluations.
     """
     log_b = -math.log(len(start))
     potential = start - start.mean()
@@ -338,13 +322,9 @@ def solve_pot(
 ) -> tuple[Solution, bool]:
     """Call POT's ``sinkhorn_unbalanced`` until our own marginal error is small enough.
 
-    POT's own stopping rule looks at the scalings u and v. Their common factor does not
-    affect the rows, but converges slowest. Our error does not depend on it. The
-    arguments are those of :func:`solve_fixed_point`.
-
-    Returns:
-        The best solution, and whether POT's numbers stayed usable. If they did not,
-        another solver has to go on.
+    POT's own error depends on a factor that converges slowest and affects no row. The
+    arguments are those of :func:`solve_fixed_point`. Return the best solution, and
+    whether POT's numbers stayed usable.
     """
     # A constant added to a row of C does not change the softmax of the row. If the
     # smallest entry of every row is zero, no row of exp(-C / gamma) vanishes.
@@ -360,21 +340,12 @@ def solve_pot(
     while iterations < max_iterations:
         burst = min(burst, max_iterations - iterations)
         with warnings.catch_warnings():
-            # POT's warnings are not needed: its results are checked below.
             warnings.simplefilter("ignore")
+            options: Any = {"numItermax": burst, "stopThr": 0.0, "log": True}
+            # POT computes u from v first, so that u may start at zero.
+            options["warmstart"] = (scaled.new_zeros(n_o), potential)
             _, log = ot.unbalanced.sinkhorn_unbalanced(
-                a,
-                b,
-                scaled,
-                reg=1.0,
-                reg_m=(math.inf, rho),
-                method="sinkhorn",
-                reg_type="kl",
-                # POT computes u from v first, so that u may start at zero.
-                warmstart=(scaled.new_zeros(n_o), potential),
-                numItermax=burst,
-                stopThr=0.0,
-                log=True,
+                a, b, scaled, 1.0, (math.inf, rho), "sinkhorn", "kl", **options
             )
         done = len(log["err"])
         iterations += done

@@ -14,8 +14,6 @@ from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalDensityEstimator
 from sbi_rope.errors import InvalidInputError, warn_user
 
-__all__ = ["Accept", "Density", "Given", "Prior", "batches", "num_fitting"]
-
 # sbi converts every x to this dtype, and its estimators work in no other.
 DTYPE = torch.float32
 
@@ -36,8 +34,8 @@ def batches(rows: Tensor, *, share: int = 1) -> Sequence[Tensor]:
     size = GPU_BATCH
     if rows.device.type == "cpu":
         size = CPU_BATCH
-        # glibc returns freed memory to the system, page by page, unless it once freed a
-        # block of almost 32 MiB. Flows are a third faster with memory that is kept.
+        # glibc keeps freed memory only after it once freed a block of almost 32 MiB.
+        # Flows are a third faster then.
         torch.empty(2**25 - 2**16, dtype=torch.uint8)
     return rows.split(max(1, size // share))
 
@@ -129,9 +127,7 @@ class Density(ConditionalDensityEstimator):
 
         The random numbers are the same in every call. In a mixture, a part needs draws
         for its ``share`` only, and a ``seed`` of its own, so that errors average out.
-
-        Returns:
-            Shape ``(B,)``, float64.
+        The result is float64.
         """
         count = math.ceil(NUM_DRAWS * share)
         every = torch.arange(num_rows, device=self.device)
@@ -143,17 +139,12 @@ class Density(ConditionalDensityEstimator):
         return torch.cat(inside).double().reshape(num_rows, count).mean(dim=1)
 
     def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
-        r"""Return :math:`\log q(\theta \mid x)`.
+        r"""Return :math:`\log q(\theta \mid x)`, shape ``(S, B)``.
 
         Args:
-            input: theta, shape ``(S, B, d)`` or ``(B, d)``. One row of theta serves
-                all observations.
-            condition: Observations, shape ``(B, *event)``. One observation serves all
-                rows of theta, and is embedded once.
+            input: theta, shape ``(S, B, d)`` or ``(B, d)``; one row serves all x.
+            condition: Observations ``(B, *event)``; one serves all rows of theta.
             **kwargs: Not used.
-
-        Returns:
-            Shape ``(S, B)``.
         """
         z = self.embed(condition)
         return self.log_prob_given(input, z, len(condition)).to(input)
@@ -248,10 +239,8 @@ class Given(Density):
                 f"got {type(own).__name__}."
             )
         with torch.no_grad():
-            shapes = (
-                tuple(own.log_prob(theta[None], x).shape),
-                tuple(own.sample(torch.Size((3,)), x).shape),
-            )
+            found = own.log_prob(theta[None], x), own.sample(torch.Size((3,)), x)
+            shapes = tuple(tuple(one.shape) for one in found)
         expected = ((1, len(x)), (3, *theta.shape))
         if shapes != expected:
             raise InvalidInputError(

@@ -23,8 +23,6 @@ from sbi_rope.density.base import (
 from sbi_rope.ensemble import drawn, log_density
 from sbi_rope.errors import InvalidInputError, warn_user
 
-__all__ = ["Coupled", "OverSimulations"]
-
 
 class OverSimulations(Density):
     r"""A density that is mixed over simulations, with weights that depend on x.
@@ -80,9 +78,8 @@ class OverSimulations(Density):
         for pairs in batches(torch.arange(len(theta) * len(row), device=theta.device)):
             sample, k = pairs // len(row), pairs % len(row)
             points = without_nan_gradients(theta[sample, row[k]])
-            log_terms.append(
-                log_density(self.density, points, self.simulated[column[k]])
-            )
+            of_pairs = log_density(self.density, points, self.simulated[column[k]])
+            log_terms.append(of_pairs)
         log_q = without_nan(torch.cat(log_terms)).double()
         return log_q.reshape(len(theta), len(row))
 
@@ -91,11 +88,9 @@ class OverSimulations(Density):
         """Draw once for each of n numbers of observations, ``(n, d)``."""
         used, place = row.unique(return_inverse=True)
         column, size = torch.empty_like(row), num_fitting(len(self.simulated))
-        for start, some in zip(
-            range(0, len(used), size), used.split(size), strict=True
-        ):
-            mine = (place >= start) & (place < start + size)
-            column[mine] = _chosen(self.rows(z[some]), place[mine] - start)
+        for number, some in enumerate(used.split(size)):
+            mine = place // size == number
+            column[mine] = _chosen(self.rows(z[some]), place[mine] % size)
         theta = [drawn(self.density, self.simulated[some]) for some in batches(column)]
         return torch.cat(theta)
 
@@ -126,7 +121,7 @@ class Coupled(OverSimulations):
         net: The embedding net g of real observations, for unseen ones.
         coupling: The coupling of :math:`g(x_o)` with the simulations.
         unseen: What to do with an x outside the batch: ``"raise"`` an error, or
-            ``"extend"`` the coupling by a softmax row under the same potential.
+            ``"extend"`` the coupling by a row under the same potential.
     """
 
     x_o: Tensor
@@ -216,11 +211,7 @@ class Coupled(OverSimulations):
 
 
 def without_tail(weights: Tensor, tail_mass: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Return row, column and log weight of the entries of weights to evaluate.
-
-    The smallest weights of each row are left out, as long as they sum to at most
-    ``tail_mass``.
-    """
+    """Return row, column and log weight of all but the smallest weights of a row."""
     # The sum starts at the smallest weights, so that rounding does not lose them.
     ascending, order = weights.sort(dim=1)
     kept = (ascending.cumsum(dim=1, dtype=torch.double) > tail_mass) & (ascending > 0)
@@ -259,8 +250,7 @@ def _chosen(weights: Tensor, row: Tensor) -> Tensor:
 
 def _keys(x: Tensor) -> list[bytes]:
     """Return a fingerprint of each row's values."""
-    # Adding zero turns -0.0 into 0.0. The two are equal, and so should their bytes be.
-    # The same holds for the NaN of missing entries, whose bits may differ.
+    # Adding zero turns -0.0 into 0.0. NaN may have different bits, too.
     rows = x.detach().cpu().flatten(1) + 0.0
     rows = rows.where(~rows.isnan(), torch.nan).contiguous().numpy()
     return [hashlib.blake2b(row.tobytes(), digest_size=16).digest() for row in rows]

@@ -26,8 +26,6 @@ from sbi_rope.density.base import (
 )
 from sbi_rope.ensemble import Ensemble, drawn, embedded, log_density, loss_of
 
-__all__ = ["Flow"]
-
 # Observations in one call of the embedding nets.
 NET_BATCH = 1000
 
@@ -78,12 +76,7 @@ class Flow(Density):
         *,
         nets: Sequence[nn.Module] | None = None,
     ) -> "Flow":
-        """Return the average of copies of estimators of one architecture.
-
-        Args:
-            estimators: Estimators of sbi. The same one may appear several times.
-            nets: Embedding nets in the place of their own.
-        """
+        """Return the average of copies of estimators of sbi, or with other ``nets``."""
         first = estimators[0]
         own = {id(one): embedding_of(one) for one in estimators}
         nets = [own[id(one)] for one in estimators] if nets is None else nets
@@ -103,15 +96,14 @@ class Flow(Density):
 
     @classmethod
     def joined(cls, flows: "Sequence[Flow]") -> "Flow":
-        """Return the average of flows that come from one NPE, with equal weights.
-
-        Where all have the same net, or the same density, the average has one, too.
-        """
+        """Return the average of flows that come from one NPE, with equal weights."""
         parts = []
         for of_each in zip(*((one.nets, one.densities) for one in flows), strict=True):
-            first = of_each[0]
-            if all(len(one) == 1 and _are_equal(one, first) for one in of_each):
-                parts.append(copy.deepcopy(first))
+            # Where all have the same net, or density, the average has one, too.
+            stacks = [list(one.parameters()) for one in of_each]
+            same = all(all(map(torch.equal, stacks[0], other)) for other in stacks)
+            if same and all(len(one) == 1 for one in of_each):
+                parts.append(copy.deepcopy(of_each[0]))
                 continue
             full = [
                 one if len(one) > 1 else one[[0] * flow.num_members]
@@ -140,11 +132,7 @@ class Flow(Density):
     def made_of(
         self, members: Sequence[tuple[int, int]], nets: Ensemble | None = None
     ) -> "Flow":
-        """Return the average of copies of some nets and densities.
-
-        Each flow is named by the number of its net and that of its density. The nets
-        may take the place of those of this flow.
-        """
+        """Return the average of copies of numbered nets (or others) and densities."""
         of_nets, of_densities = zip(*members, strict=True)
         own = self.nets if nets is None else nets
         return self._with(own[of_nets], self.densities[of_densities])
@@ -204,9 +192,8 @@ class Flow(Density):
 
     def log_q(self, theta: Tensor, z: Tensor) -> Tensor:
         """Return the log density at theta ``(S, B, d)``, shape ``(S, B)``, float64."""
-        return (self.log_probs(theta, z) + self.weights.log()[:, None, None]).logsumexp(
-            0
-        )
+        log_weights = self.weights.log()[:, None, None]
+        return (self.log_probs(theta, z) + log_weights).logsumexp(0)
 
     def log_probs(self, theta: Tensor, z: Tensor) -> Tensor:
         """Return the log density of each flow at theta, ``(E, S, B)``, float64."""
@@ -214,9 +201,7 @@ class Flow(Density):
         theta = theta.flatten(0, 1)
         row = torch.arange(shape[1], device=theta.device).repeat(shape[0])
         parts = []
-        for pairs in batches(
-            torch.arange(len(theta), device=theta.device), share=count
-        ):
+        for pairs in batches(torch.arange(len(theta)).to(row), share=count):
             of_each = z[row[pairs]].expand(-1, count, -1).transpose(0, 1)
             points = theta[pairs].expand(count, -1, -1).flatten(0, 1)
             log_probs = self.densities.answer(
@@ -253,8 +238,3 @@ class Flow(Density):
     def forward(self, x: Tensor) -> Tensor:
         """Return the embeddings by all nets, side by side, ``(B, E * l)``."""
         return self.embed(x).flatten(1)
-
-
-def _are_equal(one: Ensemble, other: Ensemble) -> bool:
-    pairs = zip(one.parameters(), other.parameters(), strict=True)
-    return one is other or all(torch.equal(*pair) for pair in pairs)

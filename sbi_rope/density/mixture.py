@@ -17,8 +17,6 @@ from sbi_rope.density.posterior import MixturePosterior
 from sbi_rope.errors import InvalidInputError, shown
 from sbi_rope.settings import check
 
-__all__ = ["Mixture", "average", "density_of"]
-
 # Draws of the first prior, at which the others must have the same density.
 NUM_FROM_PRIOR = 100
 
@@ -45,11 +43,10 @@ class Mixture(Density):
         shares = torch.as_tensor(weights, dtype=torch.double).tolist()
         for part, weight in zip(parts, shares, strict=True):
             shapes = part.input_shape, part.condition_shape
-            if shapes != (self.input_shape, self.condition_shape):
+            if shapes != (expected := (self.input_shape, self.condition_shape)):
                 raise InvalidInputError(
-                    f"Expected parts of theta {tuple(self.input_shape)} given x "
-                    f"{tuple(self.condition_shape)}, as the first; got theta "
-                    f"{tuple(shapes[0])} given x {tuple(shapes[1])}."
+                    "Expected posteriors with theta and x of the same shapes "
+                    f"{expected}; got {shapes}."
                 )
             of_part = part.weights.tolist() if isinstance(part, Mixture) else [1.0]
             own = part.parts if isinstance(part, Mixture) else [part]
@@ -114,11 +111,7 @@ class Mixture(Density):
 
 
 def density_of(posterior: Any, *, what: str = "a posterior") -> Density:
-    """Return a copy of the density of a posterior, of this package or of NPE.
-
-    Raises:
-        UnsupportedPosteriorError: If it has no density or no embedding of x.
-    """
+    """Return a copy of the density of a posterior, of this package or of NPE."""
     if isinstance(posterior, MixturePosterior):
         return copy.deepcopy(posterior.posterior_estimator)
     return Flow.of([check_density(estimator_of(posterior), what=what)])
@@ -133,9 +126,9 @@ def average(
         p(\theta \mid x) \propto \mathbf{1}[\theta \in \operatorname{supp} p]
         \sum_m w_m\, q_m(\theta \mid x)
 
-    An ensemble of NPEs is repaired in this way: every member by itself, because each
-    has an embedding net of its own. The average is normalised as a whole, so that a
-    member with much of its mass outside the prior counts for less.
+    An ensemble of NPEs is repaired in this way, every member by itself. The average is
+    normalised as a whole, so that a member with much of its mass outside the prior
+    counts for less.
 
     Args:
         posteriors: What ``stack``, ``RoPE.build_posterior`` or a trainer returns, or
@@ -143,12 +136,8 @@ def average(
             belong to the same batch.
         weights: One for each posterior, with a sum of one; equal if None.
 
-    Returns:
-        The average. It belongs to a batch if one of the posteriors does.
-
     Raises:
-        InvalidInputError: If there is no posterior, shapes, batches or priors differ,
-            or the weights do not fit.
+        InvalidInputError: If shapes, batches or priors differ, or weights do not fit.
         UnsupportedPosteriorError: If one of them has no density or no embedding of x.
 
     Example:

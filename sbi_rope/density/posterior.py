@@ -14,10 +14,7 @@ from torch.distributions import Distribution
 from sbi_rope._prior import PriorDistribution
 from sbi_rope._progress import is_shown, progress_bar
 from sbi_rope._random import seeded
-from sbi_rope._sbi import (
-    BaseDirectPosterior,
-    MixedDensity,
-)
+from sbi_rope._sbi import BaseDirectPosterior, MixedDensity
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope.coupling import Coupling
 from sbi_rope.density.base import (
@@ -35,15 +32,12 @@ from sbi_rope.sets import MakesSets
 from sbi_rope.settings import Count, Positive, check
 from sbi_rope.tensors import as_batch, as_numbers, rows_with
 
-__all__ = ["MixturePosterior", "PriorPosterior"]
-
 # An observation is slow if, after MIN_PROPOSALS proposals, less than a share of
 # MIN_ACCEPTANCE of them lies inside the prior's support. Rejection sampling gives up on
 # slow observations if they would take more than MAX_PROPOSALS further proposals, which
 # are minutes. In a stack the prior often keeps a share just below MIN_ACCEPTANCE.
 MIN_PROPOSALS, MIN_ACCEPTANCE, MAX_PROPOSALS = 100_000, 1e-3, 10_000_000
-# Observations for which this many proposals were all rejected are counted together: if
-# a whole batch lies outside the support, MIN_PROPOSALS for all of it are enough.
+# Observations for which this many proposals were all rejected are counted together.
 MIN_WITHOUT_ANY = 5_000
 # A flow takes about as long for this many draws as for a single one.
 SMALL_BATCH = 512
@@ -63,12 +57,9 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         \qquad Z_i = \sum_j \alpha_{ij} Z_j .
 
     It has all methods of sbi's :class:`DirectPosterior` and works with sbi's
-    diagnostics. That of RoPE belongs to a batch of observations: diagnostics such as
-    simulation-based calibration only make sense for its ``x_o`` and their true
-    parameters. Others are amortised and answer any x.
-
-    Apart from arguments and result it needs some 150 MB. A matrix of size n_o x n_s is
-    never held.
+    diagnostics. That of RoPE belongs to a batch of observations, its ``x_o``. Others
+    are amortised and answer any x. Apart from arguments and result it needs some 150
+    MB.
 
     References:
         | Addressing Misspecification in Simulation-based Inference through Data-driven
@@ -101,12 +92,17 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         # A category that sbi has standardised and put back may differ by rounding, and
         # is no category then.
         is_mixed = any(isinstance(part, MixedDensity) for part in density.modules())
+        enable_transform = enable_transform and not is_mixed
+        self._set_up(density, PriorDistribution(prior), enable_transform)
+
+    def _set_up(self, density: Density, prior: Any, enable_transform: bool) -> None:  # noqa: FBT001
         with seeded(0):  # sbi draws from the prior to find out about it
-            super().__init__(
+            BaseDirectPosterior.__init__(
+                self,
                 density,
-                PriorDistribution(prior),
-                device=density.device,
-                enable_transform=enable_transform and not is_mixed,
+                prior,
+                device=str(density.device),
+                enable_transform=enable_transform,
             )
         self.posterior_estimator: Density = density
 
@@ -161,10 +157,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         return True  # also an amortised one, which has no length
 
     def __getitem__(self, index: int) -> "MixturePosterior":
-        """Return the posterior of one observation, which is its default x.
-
-        It does not know the other observations of the batch.
-        """
+        """Return the posterior of one observation alone, which is its default x."""
         index = range(len(self))[operator.index(index)]
         density = self.posterior_estimator.restricted_to(index)
         view = copy.copy(self)
@@ -184,14 +177,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         x, self._latest = self.default_x, None
         self.prior.to(device)
         density = self.posterior_estimator.to(device)
-        with seeded(0):  # sbi draws from the prior to find out about it
-            BaseDirectPosterior.__init__(
-                self,
-                density,
-                self.prior,
-                device=str(density.device),
-                enable_transform=self.enable_transform,
-            )
+        self._set_up(density, self.prior, self.enable_transform)
         if x is not None:
             self._keep_default_x(x)
 
@@ -234,11 +220,8 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         return x
 
     def _parameters(self, theta: Any, *, batched: bool = False) -> Tensor:
-        """Return parameters in float32, ``(n, d)``, or ``(S, B, d)`` of a batch.
-
-        A bound of the prior is one in float32 only: 0.1 of float64 is below the 0.1 of
-        a prior.
-        """
+        """Return parameters in float32, ``(n, d)``, or ``(S, B, d)`` of a batch."""
+        # A bound of the prior is one in float32 only: 0.1 of float64 is below it.
         dim = self.posterior_estimator.input_shape[0]
         numbers = as_numbers("theta", theta, names=self.parameter_names)
         theta = theta if isinstance(theta, Tensor) else numbers  # which has gradients
@@ -267,8 +250,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         r"""Draw from :math:`p(\theta \mid x)` of one observation.
 
         The default x is taken if there is none. The other arguments, and errors, are
-        those of :meth:`sample_batched`. Returns a tensor of shape
-        ``(*sample_shape, d)``.
+        those of :meth:`sample_batched`. The result has shape ``(*sample_shape, d)``.
         """
         x = self._one_x(x)
         return self.sample_batched(sample_shape, x, *args, **options).squeeze(-2)
@@ -287,8 +269,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         Args:
             sample_shape: Shape of the draws of each observation.
             x: Observations, shape ``(B, *event)``.
-            max_sampling_batch_size: The largest number of draws the flow makes at a
-                time. If None, the number that is fast on the device.
+            max_sampling_batch_size: The most draws that are made at a time.
             show_progress_bars: Whether to show how many draws were accepted so far.
                 None does so in a terminal or a notebook, but not in a file.
             reject_outside_prior: Whether to draw from the density truncated to the
@@ -312,7 +293,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         num_samples, num_rows = shape.numel(), len(x)
         total, start = num_samples * num_rows, time.monotonic()
 
-        def draw(row: Tensor) -> Tensor:
+        def propose(row: Tensor) -> Tensor:
             if max_sampling_time and time.monotonic() > start + max_sampling_time:
                 raise SamplingError(
                     "Sampling took longer than `max_sampling_time`: not all of "
@@ -321,19 +302,19 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             parts = row.split(max_sampling_batch_size or len(row))
             return torch.cat([density.draw(z, some) for some in parts])
 
+        draw: Callable[[Tensor], Tensor] = propose
         if reject_outside_prior:
-            draw = _Rejection(draw, self.prior.inside, num_rows, density.device)
+            draw = rejecting(propose, self.prior.inside, num_rows)
         theta = torch.empty(total, *density.input_shape, device=density.device)
+        show = is_shown(show_progress_bars)
         with (
             torch.no_grad(),
-            progress_bar(
-                show=is_shown(show_progress_bars), desc="Sampling", total=total
-            ) as bar,
+            progress_bar(show=show, desc="Sampling", total=total) as bar,
         ):
             # Observation by observation, so that few of them are needed at a time.
             for first in range(0, total, MAX_ENTRIES):
                 last = min(first + MAX_ENTRIES, total)
-                slot = torch.arange(first, last, device=density.device)
+                slot = torch.arange(first, last, device=theta.device)
                 row, number = slot // num_samples, slot % num_samples
                 theta[number * num_rows + row] = draw(row)
                 bar.update(len(slot))
@@ -374,7 +355,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         Parameters of shape ``(B, d)`` or ``(S, B, d)`` belong to observations
         ``(B, *event)``. One row of theta serves all observations, and one observation
         all rows of theta. The other arguments, and errors, are those of
-        :meth:`log_prob`. Returns a tensor of shape ``(1, B)`` or ``(S, B)``.
+        :meth:`log_prob`. The result has shape ``(1, B)`` or ``(S, B)``.
         """
         theta = self._parameters(theta, batched=True)
         x = self._warned_of(self._batch_of_x(x))
@@ -408,9 +389,8 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
     def map(self, x: Tensor | None = None, **options: Any) -> Tensor:  # type: ignore[override]
         """Return the maximum of the density given the default x, as in sbi, ``(1, d)``.
 
-        Every step evaluates all components for all starting points. The defaults are
-        smaller than those of sbi, which would take many minutes: ``num_iter`` and
-        ``num_init_samples`` are 100, and ``num_to_optimize`` is 5.
+        The defaults are smaller than those of sbi, which would take many minutes:
+        ``num_iter`` and ``num_init_samples`` are 100, and ``num_to_optimize`` is 5.
         """
         own: dict[str, Any] = dict(
             num_iter=100, num_init_samples=100, num_to_optimize=5
@@ -424,11 +404,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         r"""Return the mass of the density inside the prior's support, ``(B,)``.
 
         It is estimated from 1024 draws with a seed of their own, so that ``log_prob``
-        always returns the same numbers. It is kept until other observations are asked
-        for.
-
-        Args:
-            x: Observations, shape ``(B, *event)``.
+        of observations ``(B, *event)`` always returns the same numbers.
 
         Raises:
             SamplingError: If one of the masses is zero.
@@ -452,36 +428,26 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         return mass
 
 
-class _Rejection:
-    """Proposes until a draw is accepted, and counts the proposals of each row."""
+def rejecting(
+    propose: Callable[[Tensor], Tensor], accept: Accept, num_rows: int
+) -> Callable[[Tensor], Tensor]:
+    """Return a function that proposes until a draw of each row is accepted."""
+    proposed, inside = torch.zeros(2, num_rows, dtype=torch.long)
 
-    def __init__(
-        self,
-        propose: Callable[[Tensor], Tensor],
-        accept: Accept,
-        num_rows: int,
-        device: torch.device,
-    ) -> None:
-        self.propose, self.accept, self.num_rows = propose, accept, num_rows
-        self.proposed = torch.zeros(num_rows, dtype=torch.long, device=device)
-        self.inside = torch.zeros_like(self.proposed)
-
-    def __call__(self, row: Tensor) -> Tensor:
-        """Draw for each of n numbers of rows until a draw is accepted, ``(n, d)``."""
-        theta: Tensor | None = None
+    def draw(row: Tensor) -> Tensor:
+        theta = torch.empty(0)
         still_open = torch.ones_like(row, dtype=torch.bool)
         rate = 1.0
         while (open_slots := still_open.nonzero().flatten()).numel():
-            # At this rate most slots are filled. For the last few slots, more proposals
-            # take no longer than one.
+            # For the last few slots, more proposals take no longer than one.
             count = len(open_slots)
             wanted = max(int(1 / max(rate, MIN_ACCEPTANCE)), SMALL_BATCH // count)
             repeats = max(1, min(wanted, num_fitting(count)))
             proposals = open_slots.repeat_interleave(repeats)
             rows = row[proposals]
-            draws = self.propose(rows)
-            accepted = self.accept(draws)
-            if theta is None:
+            draws = propose(rows)
+            accepted = accept(draws)
+            if not len(theta):
                 theta = draws.new_empty(len(row), *draws.shape[1:])
             # Of several proposals for a slot the first accepted one is kept.
             chosen = accepted.nonzero().flatten()
@@ -490,41 +456,40 @@ class _Rejection:
             first[:1] = True
             theta[filled[first]] = draws[chosen[first]]
             still_open[filled] = False
-            self.count(rows, accepted, row[still_open])
+            proposed.add_(rows.bincount(minlength=num_rows).cpu())
+            inside.add_(rows[accepted].bincount(minlength=num_rows).cpu())
+            missing = row[still_open].bincount(minlength=num_rows).cpu()
+            _give_up_on_hopeless(proposed, inside, missing)
             rate = float(accepted.double().mean())
-        assert theta is not None
         return theta
 
-    def count(self, rows: Tensor, accepted: Tensor, missing: Tensor) -> None:
-        """Count proposals, and give up on rows that would take too many more."""
-        self.proposed += rows.bincount(minlength=self.num_rows)
-        self.inside += rows[accepted].bincount(minlength=self.num_rows)
-        num_missing = missing.bincount(minlength=self.num_rows)
-        share = self.inside / self.proposed.clamp_min(1)
-        slow = (num_missing > 0) & (self.proposed >= MIN_PROPOSALS)
-        slow &= share < MIN_ACCEPTANCE
-        # Infinite if nothing was accepted so far.
-        further = (num_missing[slow] / share[slow]).sum()
-        hopeless = slow & (further > MAX_PROPOSALS)
-        without_any = (self.proposed >= MIN_WITHOUT_ANY) & (self.inside == 0)
-        if int(self.proposed[without_any].sum()) >= MIN_PROPOSALS:
-            hopeless |= without_any
-        if hopeless.any():
-            numbers = hopeless.nonzero().flatten()[:5].tolist()
-            raise SamplingError(
-                f"Less than one in {int(1 / MIN_ACCEPTANCE)} draws lies inside the "
-                f"support of the prior for rows {numbers} of `x`. Leave these "
-                "observations out, train NPE longer, or pass "
-                "reject_outside_prior=False."
-            )
+    return draw
+
+
+def _give_up_on_hopeless(proposed: Tensor, inside: Tensor, missing: Tensor) -> None:
+    """Raise if some rows would take too many more proposals."""
+    share = inside / proposed.clamp_min(1)
+    slow = (missing > 0) & (proposed >= MIN_PROPOSALS) & (share < MIN_ACCEPTANCE)
+    # Infinite if nothing was accepted so far.
+    further = (missing[slow] / share[slow]).sum()
+    hopeless = slow & (further > MAX_PROPOSALS)
+    without_any = (proposed >= MIN_WITHOUT_ANY) & (inside == 0)
+    if int(proposed[without_any].sum()) >= MIN_PROPOSALS:
+        hopeless |= without_any
+    if hopeless.any():
+        numbers = hopeless.nonzero().flatten()[:5].tolist()
+        raise SamplingError(
+            f"Less than one in {int(1 / MIN_ACCEPTANCE)} draws lies inside the support "
+            f"of the prior for rows {numbers} of `x`. Leave these observations out, "
+            "train NPE longer, or pass reject_outside_prior=False."
+        )
 
 
 class PriorPosterior(MixturePosterior):
     r"""The prior :math:`p(\theta)`, in the form of an sbi posterior that ignores x.
 
-    It is calibrated whenever the prior is right. An estimate that has learnt something
-    from x has a higher log posterior probability. ``sample`` and ``log_prob`` need no
-    observation, and the batched methods take observations of any shape.
+    ``sample`` and ``log_prob`` need no observation, and the batched methods take
+    observations of any shape.
 
     References:
         | Addressing Misspecification in Simulation-based Inference through Data-driven

@@ -13,14 +13,11 @@ from torch.distributions import Chi2
 from sbi_rope._sbi import embed
 from sbi_rope.density.base import Density
 
-__all__ = ["GaussianProcess"]
-
 # More entries than these are reduced to principal components, at most so many.
 MAX_ENTRIES, MAX_COMPONENTS = 20, 10
 # Medians of the length scales, relative to the root of the number of inputs, of the
 # variance and of the noise, and standard deviations of their logarithms in the prior.
-# Without a prior, ten pairs are fitted by chance. Chosen on calibration pairs, see
-# benchmarks/choices.md.
+# Chosen on calibration pairs, see benchmarks/choices.md.
 LENGTH, VARIANCE, NOISE = (3.0, 0.5), (1.0, 2.0), (0.1, 2.0)
 # Pairs that these are learned from, and steps of the optimiser.
 MAX_PAIRS, MAX_STEPS = 100, 15
@@ -185,13 +182,9 @@ def _learned(inputs: Tensor, y: Tensor) -> Tensor:
             off = (at - start) / spread
             return value + off @ off / 2, gradient + off / spread
 
+        options: Any = {"method": "L-BFGS-B", "options": {"maxiter": MAX_STEPS}}
         found = minimize(
-            negative_log_posterior,
-            start,
-            jac=True,
-            method="L-BFGS-B",
-            bounds=bounds,
-            options={"maxiter": MAX_STEPS},
+            negative_log_posterior, start, jac=True, bounds=bounds, **options
         )
         return found.x, found.fun
 

@@ -36,8 +36,6 @@ from sbi_rope.trainers.training import (
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["Kind", "Method"]
-
 Kind = Literal["simulations", "calibration", "observations"]
 # What data are called in messages, and the call that takes them.
 DATA: dict[Kind, tuple[str, str]] = {
@@ -50,9 +48,8 @@ DATA: dict[Kind, tuple[str, str]] = {
 class Data:
     """Simulations, calibration pairs and observations with x of the same shape.
 
-    All are copied, in float32. Nothing is added of what does not fit. Tables whose
-    columns have the names of an earlier table are put into its order. Missing entries
-    (NaN) are accepted if the embedding net of a trained NPE can read them.
+    All are copied, in float32. Missing entries (NaN) are accepted if the embedding net
+    of a trained NPE can read them.
     """
 
     def __init__(self, prior: Distribution, device: torch.device) -> None:
@@ -91,17 +88,12 @@ class Data:
     def append(self, kind: Kind, x: Any, theta: Any = None) -> None:
         """Add data; simulations that cannot be read are dropped with a warning."""
         new: tuple[Tensor, ...] = ()
-        name = "x_o" if kind == "observations" else "x"
+        name, rows = "x_o" if kind == "observations" else "x", None
         if kind != "observations":
-            new = (self.read_theta(theta),)
+            new, rows = (self.read_theta(theta),), len(theta)
             check_in_support("theta", new[0], self._prior)
         read = as_batch(
-            name,
-            x,
-            self.event_shape,
-            rows=len(new[0]) if new else None,
-            names=self.x_names,
-            finite=False,
+            name, x, self.event_shape, rows=rows, names=self.x_names, finite=False
         )
         if read.ndim < 2:
             raise InvalidInputError(
@@ -110,12 +102,12 @@ class Data:
             )
         new = (*new, self._copied(read))
         valid = self.readable(new[-1])
+        if not valid.all() and (kind != "simulations" or not valid.any()):
+            raise InvalidInputError(
+                f"Expected `{name}` to be finite; got NaN or Inf in "
+                f"{rows_with(~valid)}."
+            )
         if not valid.all():
-            if kind != "simulations" or not valid.any():
-                raise InvalidInputError(
-                    f"Expected `{name}` to be finite; got NaN or Inf in "
-                    f"{rows_with(~valid)}."
-                )
             warn_user(
                 f"Dropped {int((~valid).sum())} of {len(valid)} simulations because "
                 "they contain NaN or Inf."
@@ -145,16 +137,14 @@ class Method(ABC):
 
     What is passed in is copied or only read. Appending data after a training asks for
     another one, which starts anew. ``train`` and what appends return the method, so
-    that calls can be chained.
+    that calls can be chained. Of data that do not fit nothing is added.
 
-    A subclass says which data it ``sees`` and returns a posterior from ``_fit``. Data
-    that do not fit raise an ``InvalidInputError``, and nothing is added then. Options
+    A subclass says which data it ``sees`` and returns a posterior from ``_fit``. Options
     that a method has no use for raise a ``TypeError``.
 
     Attributes:
         sees: The kinds of data that can be appended.
-        starts_from_npe: Whether it starts from NPE, so that :meth:`from_posterior` can
-            take a trained one.
+        starts_from_npe: Whether it starts from NPE, see :meth:`from_posterior`.
         trains_on_statistics: Whether it trains on statistics of simulations, so that it
             needs simulations also beside a trained NPE.
         simulates: Whether it makes simulations of its own. Without a simulator it looks
@@ -235,10 +225,6 @@ class Method(ABC):
             **options: Keyword arguments of the constructor, except for ``device`` and
                 what concerns the training of NPE.
 
-        Returns:
-            The method. If its ``needs_simulations`` is False, simulations that are
-            appended have no effect.
-
         Raises:
             UnsupportedPosteriorError: If it is not a plain amortised posterior.
         """
@@ -261,8 +247,7 @@ class Method(ABC):
     def append_simulations(self, theta: Tensor, x: Tensor) -> "Self":
         """Add simulations; may be called repeatedly.
 
-        Simulations with NaN or Inf are dropped with a warning. NaN stays if it stands
-        for a missing trial that the embedding net leaves out.
+        Those with NaN or Inf that the embedding net cannot read are dropped.
 
         Args:
             theta: Parameters drawn from the prior, shape ``(n, d)``.
@@ -310,11 +295,7 @@ class Method(ABC):
         return self
 
     def build_posterior(self) -> Any:
-        """Return a copy of the trained posterior, a posterior of sbi.
-
-        Raises:
-            NotReadyError: If ``train()`` was not called since data was appended.
-        """
+        """Return a copy of the trained posterior, a posterior of sbi."""
         if self._posterior is None:
             raise NotReadyError(
                 f"{type(self).__name__} is not trained, or data was appended since. "
@@ -376,10 +357,9 @@ class Method(ABC):
 
     def _append(self, kind: Kind, *data: Any) -> "Self":
         if kind not in self.sees:
-            seen = [DATA[one][0] for one in DATA if one in self.sees]
             raise InvalidInputError(
-                f"Expected a method that sees {DATA[kind][0]}; {type(self).__name__} "
-                f"sees {'only ' + ' and '.join(seen) if seen else 'no data'}."
+                f"Expected a method that sees {DATA[kind][0]}; got "
+                f"{type(self).__name__}, which does not."
             )
         self._data.append(kind, *data)
         self._posterior = self._history = None
@@ -391,9 +371,8 @@ class Method(ABC):
             what, call = DATA[kind]
             is_needed = kind != "simulations" or self.needs_simulations
             least = self.min_pairs if kind == "calibration" else 1
-            if not is_needed or kind not in self.sees:
-                continue
-            if (count := self._data.count(kind)) < least:
+            count = self._data.count(kind)
+            if is_needed and kind in self.sees and count < least:
                 raise NotReadyError(
                     f"{type(self).__name__} needs at least {least} {what}; got "
                     f"{count}. Call `{call}` first."

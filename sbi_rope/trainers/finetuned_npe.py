@@ -20,8 +20,6 @@ from sbi_rope.trainers.training import EstimatorBuilder
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["FinetunedNPE"]
-
 
 class FinetunedNPE(Method):
     r"""NPE trained on simulations, then as a whole on the calibration pairs.
@@ -32,22 +30,19 @@ class FinetunedNPE(Method):
 
     All parameters, of the embedding net and of the density, are tuned in evaluation
     mode (no dropout, fixed batch statistics). A part of the pairs is held out; of
-    several learning rates and of all epochs the best on them is kept, the starting
-    point included.
+    several learning rates and of all epochs, the start included, the best is kept.
 
     With ``num_holdouts`` = K above one this is done K times, each with another part of
     the pairs held out, and the posterior is the average of the K networks,
 
-    .. math:: p(\theta \mid x) = \tfrac1K \sum_k q_k(\theta \mid h_k(x)) .
+    .. math:: p(\theta \mid x) = \tfrac1K \sum_k q_k(\theta \mid h_k(x)) ,
 
-    Networks that few pairs have led astray are not astray in the same way, so that an
-    average of five is better than each of them, and better calibrated.
+    which is better than each of them, and better calibrated.
 
-    Sees simulations and the calibration set. Assumes that what NPE has learnt is a good
-    start. To be preferred from some 200 pairs on, where it is among the
-    strongest of the cheap methods; with 10 it can be worse than the prior. The
-    posterior of :class:`~sbi_rope.discrepancy.DiscrepancyNPE` is a better start than
-    that of NPE: pass it to :meth:`from_posterior`.
+    Sees simulations and the calibration set. To be preferred from some 200 pairs on;
+    with 10 it can be worse than the prior. The posterior of
+    :class:`~sbi_rope.discrepancy.DiscrepancyNPE` is a better start than that of NPE:
+    pass it to :meth:`from_posterior`.
 
     References:
         | Multifidelity Simulation-based Inference for Computationally Expensive
@@ -59,10 +54,9 @@ class FinetunedNPE(Method):
         density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns. An
             embedding net inside it is copied, never trained in place.
         num_holdouts: How often it is tuned. With one, ``validation_fraction`` of the
-            pairs are held out. With K, the pairs are cut into K parts and each is held
-            out once; if they have fewer than K different parameters there are as many
-            parts as these. With fewer than five different parameters none is held out,
-            and it is tuned once.
+            pairs are held out. With K, the pairs are cut into K parts (at most as many
+            as there are groups) and each is held out once. With fewer than five groups
+            none is held out, and it is tuned once.
         npe_training: How NPE is trained; ``Training()`` if None.
         training: How it is tuned, apart from the learning rate; at most 500 epochs in
             batches of 100, and 50 without improvement, if None.
@@ -112,9 +106,6 @@ class FinetunedNPE(Method):
                 ``num_holdouts`` is K.
             **options: Keyword arguments of the constructor, except for ``device`` and
                 what concerns the training of NPE.
-
-        Raises:
-            UnsupportedPosteriorError: If it is none of these.
         """
         flow = getattr(posterior, "posterior_estimator", None)
         if not isinstance(flow, Flow):
@@ -138,18 +129,14 @@ class FinetunedNPE(Method):
         start = Flow.of([own]) if self._start is None else self._start
         theta, x = self._data.calibration
         warn_of_far_entries("x", x, start)
-        splits = self._splits()
+        splits, training = self._splits(), self.training
         # There is one start for all splits, or as many as splits. Where pairs are too
         # few for that, splits are used again.
         count = max(start.num_members, len(splits))
         splits = [splits[k % len(splits)] for k in range(count)]
-        max_num_epochs = epochs_on_pairs(
-            theta, splits[0][1], self.training.max_num_epochs
-        )
-        rates = self.learning_rates
-        if not len(splits[0][1]):
-            rates = (min(rates),)
-        members = [k % start.num_members for k in range(count) for _ in rates]
+        max_num_epochs = epochs_on_pairs(theta, splits[0][1], training.max_num_epochs)
+        rates = self.learning_rates if len(splits[0][1]) else [min(self.learning_rates)]
+        members = [k for k in range(count) for _ in rates]
         sizes = len(start.nets), len(start.densities)
         flow = start.made_of([(k % sizes[0], k % sizes[1]) for k in members])
         histories = finetune_flow(
@@ -157,7 +144,7 @@ class FinetunedNPE(Method):
             [Nodes.exact(theta)] * len(members),
             x,
             [split for split in splits for _ in rates],
-            training=self.training,
+            training=training,
             learning_rates=list(rates) * count,
             max_num_epochs=max_num_epochs,
             show_progress_bars=show_progress_bars,

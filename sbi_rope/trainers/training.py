@@ -15,19 +15,13 @@ from sbi_rope.errors import InvalidInputError
 from sbi_rope.fit import History, Training
 from sbi_rope.settings import check
 
-__all__ = ["EstimatorBuilder", "estimator_builder", "train_on_simulations"]
-
 # Returns an untrained estimator for pairs (theta, x) like those it is shown.
 EstimatorBuilder = Callable[[Tensor, Tensor], Any]
 MIN_SIMULATIONS = 20
 
 
 def estimator_builder(density_estimator: Any) -> EstimatorBuilder:
-    """Return a builder of untrained estimators, from a name or from a builder.
-
-    sbi's builders put the network they were given into what they build, and training
-    then changes it. Ours builds from a copy, so that several methods can share one.
-    """
+    """Return a builder of untrained estimators, with copies of the given network."""
     check("density_estimator", density_estimator, str | Callable)
     # It holds the name, because sbi's builders cannot be pickled.
     return functools.partial(_build, density_estimator)

@@ -1,22 +1,17 @@
 """MixturePosterior keeps the contract of sbi's posteriors, and adds a batch to it."""
 
 import itertools
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch import Tensor, nn
 
 from sbi_rope.density import MixturePosterior, PriorPosterior
 from sbi_rope.errors import (
     InvalidInputError,
-    RoPEError,
     SamplingError,
 )
-from tests import problems
 from tests.problems import gaussian_posterior
 
 QUIET = {"show_progress_bars": False}
@@ -97,28 +92,6 @@ def test_sampling_gives_up_after_the_time_that_it_is_given() -> None:
             sample((3,), x, max_sampling_time=-1.0, **QUIET)
 
 
-def test_without_a_default_x_an_x_is_needed() -> None:
-    posterior = gaussian_posterior()
-    with pytest.raises(InvalidInputError, match="default x"):
-        posterior.sample((2,), **QUIET)
-    with pytest.raises(ValueError, match=r"[Dd]efault"):
-        posterior.map()
-
-
-def test_set_default_x_serves_all_methods_and_can_be_chained() -> None:
-    posterior = gaussian_posterior()
-    x, theta = posterior.x_o[3], torch.zeros(2, 2)
-    expected = posterior.log_prob(theta, x=x)
-    assert posterior.set_default_x(x) is posterior
-    assert torch.equal(posterior.log_prob(theta), expected)
-    torch.manual_seed(1)
-    samples = posterior.sample((4,), **QUIET)
-    torch.manual_seed(1)
-    assert torch.equal(posterior.sample((4,), x=x, **QUIET), samples)
-    posterior.set_default_x(posterior.x_o[0])
-    assert not torch.equal(posterior.log_prob(theta), expected)
-
-
 def test_the_potential_is_the_log_prob_without_normalisation() -> None:
     posterior = gaussian_posterior()
     theta = 3 * torch.rand(9, 2) - 1.5
@@ -159,21 +132,6 @@ def test_map_finds_the_mode() -> None:
         assert view.log_prob(mode) > best - 0.02
 
 
-@pytest.mark.medium
-def test_map_is_the_best_start_where_no_step_improves_on_it() -> None:
-    view = gaussian_posterior()[0]
-    view.map(num_iter=200, num_init_samples=200, show_progress_bars=False)
-    start = view.map(show_progress_bars=False)
-    again = view.map(
-        num_iter=1,
-        init_method=start,
-        learning_rate=10.0,
-        force_update=True,
-        show_progress_bars=False,
-    )
-    assert torch.equal(again, start)
-
-
 # --- the batch ---
 
 
@@ -190,61 +148,3 @@ def test_length_indexing_and_iteration_follow_the_batch() -> None:
         torch.equal(view.default_x[0], x)
         for view, x in zip(views, posterior.x_o, strict=True)
     )
-
-
-def test_the_posterior_of_one_observation_knows_no_other() -> None:
-    posterior = gaussian_posterior()
-    with pytest.raises(InvalidInputError, match="batch"):
-        posterior[3].log_prob(torch.zeros(1, 2), x=posterior.x_o[4])
-    image = image_posterior()[2]
-    assert image.default_x.shape == (1, 1, 8, 8)
-    assert image.sample((3,), **QUIET).shape == (3, 2)
-
-
-def test_the_posterior_of_one_observation_changes_no_other_posterior() -> None:
-    posterior = gaussian_posterior().set_default_x(torch.zeros(3))
-    first, second = posterior[0], posterior[1]
-    theta = torch.zeros(1, 2)
-    first.potential(theta)
-    second.potential(theta)
-    first.map(num_iter=2, num_init_samples=10, num_to_optimize=2)
-    first.set_default_x(torch.ones(3))
-    assert torch.equal(posterior.default_x, torch.zeros(1, 3))
-    assert torch.equal(second.default_x, posterior.x_o[1:2])
-    assert torch.equal(
-        second.potential_fn(theta), posterior.potential(theta, x=posterior.x_o[1])
-    )
-    assert posterior._map is None
-    assert second._map is None
-
-
-def test_dropout_in_the_components_does_not_blur_the_density() -> None:
-    class Noisy(problems.Gaussians):
-        def __init__(self) -> None:
-            super().__init__(2)
-            self.dropout = nn.Dropout(0.5)
-
-        def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
-            return super().log_prob(input, self.dropout(condition))
-
-    posterior = gaussian_posterior()
-    posterior.posterior_estimator.density = Noisy()
-    theta = torch.zeros(1, 2)
-    values = {
-        float(posterior.log_prob(theta, x=posterior.x_o[0], norm_posterior=False))
-        for _ in range(5)
-    }
-    assert len(values) == 1
-
-
-def test_errors_of_shapes_and_options_say_what_is_wrong() -> None:
-    p = gaussian_posterior()
-    calls: list[tuple[Callable[[], Tensor], str]] = [
-        (lambda: p.log_prob(torch.zeros(1, 1), x=p.x_o[0]), "`theta`"),
-        (lambda: p.log_prob_batched(torch.zeros(5), p.x_o), "`theta`"),
-        (lambda: p.log_prob_batched(torch.zeros(3, 2), p.x_o), "as many rows"),
-        (lambda: p.log_prob(torch.full((1, 2), torch.nan), x=p.x_o[0]), "NaN"),
-    ]
-    for call, match in calls:
-        with pytest.raises(RoPEError, match=match):
-            call()

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sbi_rope import RoPE, diagnose
+from sbi_rope import RoPE
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.metrics import draw_samples, evaluate
 from sbi_rope.trainers import FinetunedNPE
@@ -59,34 +59,6 @@ def test_pairs_and_observations_are_those_of_tensors(convert: Any) -> None:
         expected = evaluate(scored, *OBSERVED, num_samples=20, seed=0, **QUIET)
         assert scores.as_row() == pytest.approx(expected.as_row(), nan_ok=True)
         assert draw_samples(scored, x_o, num_samples=3).shape == (3, 25, 2)
-
-
-@pytest.mark.medium
-def test_a_stack_and_its_diagnosis_take_arrays() -> None:
-    x_o = array(OBSERVED[1])
-    posterior = stacked(
-        rope(map(array, PAIRS)), x_o, candidates=[PRIOR, NPE], num_folds=2
-    )
-    assert posterior.sample_batched((2,), x=x_o, **QUIET).shape == (2, 25, 2)
-    trained = rope(PAIRS).train(seed=0, **QUIET)
-    options = {"num_simulations": 100, "num_folds": None, "seed": 0, **QUIET}
-    assert str(diagnose(trained, x_o, **options)) == str(
-        diagnose(trained, OBSERVED[1], **options)
-    )
-
-
-def test_stored_simulations_and_trainers_take_arrays() -> None:
-    theta = problems.box(2).sample((1000,))
-    x = problems.simulate(theta)
-    npe = problems.npe_posterior("mdn")
-    theta_s, x_s = RoPE(npe, simulations=(array(theta), array(x))).source.from_prior(
-        2000
-    )
-    assert torch.equal(theta_s.sort(dim=0).values, theta.sort(dim=0).values)
-    assert torch.equal(x_s.sort(dim=0).values, x.sort(dim=0).values)
-    method = FinetunedNPE.from_posterior(npe, training=Training(max_num_epochs=1))
-    method.append_calibration(*map(array, PAIRS)).train(seed=0, **QUIET)
-    assert method.build_posterior().sample((2,), x=PAIRS[1][0], **QUIET).shape == (2, 2)
 
 
 @pytest.mark.medium

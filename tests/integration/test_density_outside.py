@@ -1,7 +1,6 @@
 """An NPE whose density is NaN or zero outside the prior's support and on its bounds."""
 
 import functools
-import math
 import warnings
 from dataclasses import replace
 from typing import Any
@@ -10,16 +9,13 @@ import pytest
 import torch
 from sbi.inference import NPE
 from sbi.neural_nets import posterior_nn
-from sbi.utils import within_support
 from torch import Tensor, nn
 from torch.distributions import Gamma, Independent
 
 from sbi_rope import RoPE
-from sbi_rope._prior import PriorDistribution
 from sbi_rope.baselines import FinetunedNPE
 from sbi_rope.errors import RoPEWarning
 from sbi_rope.finetuning import FINETUNING
-from sbi_rope.labels import given_labels, place_nodes, reference_of
 from sbi_rope.stacking import StackedPosterior, default_candidates, stack
 
 PRIOR = Independent(Gamma(1.5 * torch.ones(2), torch.ones(2)), 1)
@@ -91,53 +87,3 @@ def test_a_label_on_a_bound_does_not_stop_fine_tuning() -> None:
         method.train(show_progress_bars=False)
     tuned = method.build_posterior().posterior_estimator
     assert (start.loss(theta, x) - tuned.loss(theta, x)).mean() > 0.1
-
-
-def test_a_network_stays_where_it_was_if_its_only_held_out_label_is_on_a_bound() -> (
-    None
-):
-    theta = labels()[:6]
-    x = measured(theta)
-    theta[0, 0] = 0.0
-    training = replace(FINETUNING, max_num_epochs=20)
-    method = FinetunedNPE.from_posterior(
-        npe_posterior(), num_holdouts=6, training=training
-    )
-    method.append_calibration(theta, x)
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        method.train(seed=0, show_progress_bars=False)
-    assert not any("none is held out" in str(one.message) for one in told)
-    without = [h for h in method.histories if math.isinf(h.kept_validation_loss)]
-    assert [history.best_epoch for history in without] == [0]
-    assert all(math.isfinite(h.training_loss[-1]) for h in method.histories)
-
-
-@pytest.mark.slow
-def test_parameters_that_were_not_measured_do_not_stop_fine_tuning() -> None:
-    theta = labels()
-    x = measured(theta)
-    theta[::3, 0] = torch.nan
-    posterior = stacked(theta, x, "NPE", "fine-tuned NPE")
-    scores = posterior.report
-    gain = scores.scores_of("fine-tuned NPE") - scores.scores_of("NPE")
-    assert gain.mean() > 0.1
-
-
-def test_what_labels_leave_possible_is_inside_the_support() -> None:
-    theta = labels()
-    theta[::3, 0] = torch.nan
-    of_labels = given_labels(
-        theta,
-        theta_std=0.5,
-        theta_cov=None,
-        like=theta[:0],
-        prior=PriorDistribution(PRIOR),
-        names=None,
-    )
-    draws = 0.1 + torch.randn(50, 24, 2)
-    nodes = place_nodes(
-        of_labels, [reference_of(draws)], PriorDistribution(PRIOR), num_nodes=40
-    )
-    assert torch.isneginf(nodes.log_weights).any()
-    assert within_support(PRIOR, nodes.theta.reshape(-1, 2)).all()

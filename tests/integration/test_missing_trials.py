@@ -1,31 +1,23 @@
 """Missing trials (NaN) are accepted where the embedding net leaves them out."""
 
-import warnings
-
 import pytest
 import torch
-from sbi.neural_nets.embedding_nets import PermutationInvariantEmbedding
-from torch import Tensor, nn
+from torch import Tensor
 
 from sbi_rope import RoPE, diagnose
-from sbi_rope._sbi import embedding_of, posterior_from, readable, with_embedding
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import (
     InvalidInputError,
-    SimulationError,
     UnsupportedPosteriorError,
 )
 from sbi_rope.metrics import draw_samples, evaluate
 from sbi_rope.stacking import (
-    DiscrepancyCandidate,
-    FinetunedCandidate,
-    StackData,
     default_candidates,
 )
 from sbi_rope.trainers import FinetunedNPE
 from sbi_rope.trainers.training import Training
 from tests import problems
-from tests.stacks import QUICK, QUIET, rope_of, stacked
+from tests.stacks import QUICK, QUIET, stacked
 
 
 def labelled(n: int) -> tuple[Tensor, Tensor]:
@@ -94,36 +86,6 @@ def test_trainers_that_start_from_a_posterior_take_missing_trials() -> None:
         assert is_finite(method.build_posterior(), theta_o, x_o)
 
 
-def test_stored_simulations_with_missing_trials_are_kept() -> None:
-    theta = problems.box(2).sample((1002,))
-    x = problems.simulate_trials(theta)
-    x[0] = torch.nan  # a simulation that failed
-    x[1, 0, 0] = torch.inf
-    with pytest.warns(match="Dropped 2 of 1002 stored simulations"):
-        rope = RoPE(
-            problems.trials_posterior(), simulations=(theta, x), finetuner=QUICK
-        )
-    assert rope.num_dropped_simulations == 2
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        rope.append_calibration(*labelled(12)).train(**QUIET)
-
-
-def test_simulations_all_of_which_are_missing_have_failed() -> None:
-    def fails(theta: Tensor) -> Tensor:
-        x = problems.simulate_trials(theta)
-        return x.where((theta[:, 0] < 0)[:, None, None], torch.nan)
-
-    rope = RoPE(problems.trials_posterior(), simulator=fails)
-    with pytest.warns(match=r"Dropped \d+ of 200 simulations from the prior"):
-        embedded = rope.embed(labelled(20)[1], num_simulations=200, **QUIET)
-    assert (embedded.theta[:, 0] < 0).all()
-    assert rope.num_dropped_simulations == 200 - len(embedded.theta)
-    rope.append_calibration(torch.full((5, 2), 0.5), labelled(5)[1])
-    with pytest.raises(SimulationError, match=r"All \d+ simulations at"):
-        rope.train(**QUIET)
-
-
 def test_what_the_net_cannot_read_is_refused() -> None:
     for row, value in (((2,), torch.nan), ((4, 0, 0), torch.inf)):
         theta, x = labelled(10)
@@ -136,18 +98,6 @@ def test_what_the_net_cannot_read_is_refused() -> None:
     posterior = problems.trials_posterior()
     with pytest.raises(InvalidInputError, match="`x`"):
         evaluate(posterior, theta, x)
-
-
-def test_an_ordinary_net_refuses_missing_values() -> None:
-    theta = problems.box(2).sample((5,))
-    x = problems.simulate(theta)
-    x[1, 0] = torch.nan
-    rope = RoPE(problems.npe_posterior(), simulator=problems.simulate)
-    with pytest.raises(InvalidInputError, match=r"can read.*\(first: \[1\]\)"):
-        rope.append_calibration(theta, x)
-    for posterior in (problems.npe_posterior(), problems.gaussian_posterior()):
-        with pytest.raises(InvalidInputError, match="`x`"):
-            draw_samples(posterior, x, num_samples=3)
 
 
 def test_a_net_that_counts_the_trials_of_another_row_is_refused() -> None:
@@ -165,67 +115,3 @@ def test_a_net_that_counts_the_trials_of_another_row_is_refused() -> None:
         match = "embedding of a row alone than in a batch"
         with pytest.raises(UnsupportedPosteriorError, match=match):
             call()
-
-
-def test_sbis_net_is_accepted_with_one_column_for_each_trial() -> None:
-    net = PermutationInvariantEmbedding(nn.Linear(1, 4), 4, num_hiddens=8, output_dim=3)
-    x = labelled(10)[1][..., :1]
-    assert readable(net, x).all()
-
-
-def test_missing_numbers_of_a_vector_are_embedded_but_not_corrected() -> None:
-    npe = problems.npe_posterior()
-    net = nn.Sequential(problems.Filled(), *embedding_of(npe.posterior_estimator))
-    estimator = with_embedding(npe.posterior_estimator, net)
-    rope = RoPE(posterior_from(npe, estimator), simulator=problems.simulate)
-    theta = problems.box(2).sample((12,))
-    x = problems.simulate(theta)
-    x[0, 1] = torch.nan
-    rope.append_calibration(theta, x)
-    data = StackData(rope, num_folds=2, seed=0, **QUIET)
-    assert torch.isfinite(data.embedded).all()
-    untrained = RoPE(posterior_from(npe, estimator), simulator=problems.simulate)
-    assert torch.isfinite(untrained.embed(x).real).all()
-    for space, applies in (("embedding", True), ("input", False)):
-        assert DiscrepancyCandidate(space=space).suits(data) is applies
-        assert not FinetunedCandidate(space=space).suits(data)  # of two folds
-    # What is fine-tuned is corrected in x if that can be, and else in the embedding.
-    complete = rope_of()
-    for one, in_x in ((rope, False), (complete, True)):
-        three = StackData(one, num_folds=3, seed=0, **QUIET)
-        assert FinetunedCandidate(space="input").suits(three) is in_x
-        assert FinetunedCandidate(space="embedding").suits(three) is not in_x
-    method = DiscrepancyNPE.from_posterior(
-        posterior_from(npe, estimator), simulator=problems.simulate, space="input"
-    )
-    with pytest.raises(InvalidInputError, match="`x` to be finite"):
-        method.append_calibration(theta, x).train(**QUIET)
-
-
-@pytest.mark.medium
-def test_where_simulated_numbers_are_missing_nothing_says_that_they_are_constant() -> (
-    None
-):
-    def simulator(theta: Tensor) -> Tensor:
-        x = problems.simulate(theta)
-        x[::7, 1] = torch.nan
-        return x
-
-    npe = problems.npe_posterior()
-    net = nn.Sequential(problems.Filled(), *embedding_of(npe.posterior_estimator))
-    npe = posterior_from(npe, with_embedding(npe.posterior_estimator, net))
-    theta = problems.box(2).sample((12,))
-    x = problems.simulate(theta)
-    rope = RoPE(npe, simulator=simulator).append_calibration(theta, x)
-    corrected = DiscrepancyCandidate(space="input")
-    with pytest.raises(InvalidInputError, match="`x of simulations` to be finite"):
-        stacked(rope, candidates=[corrected])
-    posterior = stacked(rope, candidates=default_candidates(rope)[:4], num_folds=2)
-    assert "discrepancy" in posterior.candidate_weights
-    assert posterior.report.discrepancy is None
-    method = DiscrepancyNPE.from_posterior(npe, simulator=simulator, space="input")
-    method.append_calibration(theta, x)
-    with pytest.raises(InvalidInputError, match="`x of simulations` to be finite"):
-        method.train(**QUIET)
-    with pytest.raises(InvalidInputError, match="summaries of simulations"):
-        method.report(**QUIET)

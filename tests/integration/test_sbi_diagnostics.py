@@ -5,21 +5,17 @@ that the diagnostics must find nothing. They must notice shifted parameters.
 """
 
 import warnings
-from typing import Any
 
 import pytest
 import torch
 from sbi.diagnostics import (
-    LC2ST,
     check_sbc,
     check_tarp,
-    get_nltp,
     run_sbc,
     run_tarp,
 )
 from sbi.diagnostics.misspecification import calculate_p_misspecification
 from sbi.diagnostics.sbc import check_uniformity_frequentist
-from sbi.inference import EnsemblePosterior
 from torch import Tensor
 
 from sbi_rope import (
@@ -145,34 +141,6 @@ def test_tarp_accepts_calibrated_posteriors(
     assert p_value > 0.05
 
 
-def test_nltp_is_the_normalised_negative_log_prob(
-    posterior: MixturePosterior, theta: Tensor
-) -> None:
-    with warnings.catch_warnings():
-        warnings.filterwarnings("error", message=".*not normalized.*")
-        nltp = get_nltp(theta, posterior.x_o, posterior)
-    expected = -posterior.log_prob_batched(theta, posterior.x_o)[0]
-    assert torch.allclose(nltp, expected, atol=1e-5)
-
-
-def test_lc2st_accepts_its_samples(posterior: MixturePosterior, theta: Tensor) -> None:
-    samples = posterior.sample_batched((), posterior.x_o, **QUIET)
-    lc2st = LC2ST(
-        theta,
-        posterior.x_o,
-        samples,
-        num_trials_null=4,
-        classifier_kwargs={"hidden_layer_sizes": (8,), "max_iter": 50},
-    )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # fifty iterations do not converge
-        lc2st.train_on_observed_data(verbosity=0)
-        lc2st.train_under_null_hypothesis(verbosity=0)
-    draws = posterior[0].sample((100,), **QUIET)
-    p_value = lc2st.p_value(theta_o=draws, x_o=posterior.x_o[:1])
-    assert 0 <= p_value <= 1
-
-
 @pytest.mark.medium
 def test_misspecification_is_noticed_before_tuning_and_much_smaller_after(
     repaired: tuple[RoPE, MixturePosterior, Tensor],
@@ -186,63 +154,3 @@ def test_misspecification_is_noticed_before_tuning_and_much_smaller_after(
     )
     assert before[0] < 0.02
     assert after[1][1] < 0.3 * before[1][1]
-
-
-@pytest.mark.medium
-def test_the_diagnostics_run_on_what_rope_builds(
-    repaired: tuple[RoPE, MixturePosterior, Tensor],
-) -> None:
-    _, posterior, theta = repaired
-    settings: Any = {"num_posterior_samples": 50, "show_progress_bar": False}
-    ranks, _ = run_sbc(theta, posterior.x_o, posterior, **settings)
-    assert ranks.shape == (NUM_OBSERVATIONS, 2)
-    ecp, alpha = run_tarp(theta, posterior.x_o, posterior, **settings)
-    assert ecp.shape == alpha.shape
-    nltp = get_nltp(theta, posterior.x_o, posterior)
-    assert torch.isfinite(nltp).all()
-    # Better than the prior, log 4 on the box [-1, 1]^2, and than NPE.
-    assert nltp.mean() < 1.386
-    npe = problems.npe_posterior("maf", "none", num_epochs=30)
-    log_prob = npe.log_prob_batched(theta, posterior.x_o, norm_posterior=False)
-    assert nltp.mean() < -log_prob.mean()
-
-
-def test_an_ensemble_of_posteriors_averages_their_densities(
-    posterior: MixturePosterior,
-) -> None:
-    other = problems.gaussian_posterior(n_s=7, x_o=posterior.x_o)
-    ensemble = EnsemblePosterior([posterior, other], weights=[0.25, 0.75])
-    x, theta = posterior.x_o[3], 2 * torch.rand(6, 2) - 1
-    ensemble.set_default_x(x)
-    expected = (
-        0.25 * posterior.log_prob(theta, x=x).exp()
-        + 0.75 * other.log_prob(theta, x=x).exp()
-    )
-    assert torch.allclose(ensemble.log_prob(theta).exp(), expected, atol=1e-5)
-    samples = ensemble.sample((500,), **QUIET)
-    assert samples.shape == (500, 2)
-    assert (samples.abs() <= 1).all()
-
-
-def test_the_pair_plots_of_sbi_draw_a_posterior(
-    posterior: MixturePosterior,
-) -> None:
-    matplotlib = pytest.importorskip("matplotlib")
-    pytest.importorskip("six")
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-    from sbi.analysis import conditional_pairplot, pairplot
-
-    view = posterior[2]
-    samples = view.sample((100,), **QUIET)
-    figure, axes = pairplot(samples)
-    assert axes.shape == (2, 2)
-    pyplot.close(figure)
-    figure, axes = conditional_pairplot(
-        view,
-        condition=samples[:1],
-        limits=torch.tensor([[-1.0, 1.0]] * 2),
-        resolution=10,
-    )
-    assert axes.shape == (2, 2)
-    pyplot.close(figure)

@@ -2,7 +2,6 @@
 
 import copy
 
-import pandas as pd
 import pytest
 import torch
 from sbi.inference import EnsemblePosterior
@@ -70,17 +69,6 @@ def test_the_members_of_an_ensemble_are_repaired_one_by_one() -> None:
     assert float(share) == pytest.approx(float(alone @ WEIGHTS), abs=0.05)
 
 
-def test_an_average_is_a_copy_and_has_equal_weights_by_default() -> None:
-    member = problems.gaussian_posterior()
-    posterior = average([member, member])
-    assert posterior.posterior_estimator.weights.tolist() == [0.5, 0.5]
-    part = posterior.posterior_estimator.parts[0]
-    assert part is not member.posterior_estimator
-    # The members of an average may be averages.
-    nested = average([posterior, member], weights=[0.2, 0.8])
-    assert nested.posterior_estimator.weights.tolist() == pytest.approx([0.1, 0.1, 0.8])
-
-
 def test_what_cannot_be_averaged_is_refused() -> None:
     member = problems.gaussian_posterior()
     field = problems.vector_field_posterior("fmpe")
@@ -90,7 +78,7 @@ def test_what_cannot_be_averaged_is_refused() -> None:
         ([], None, "at least one"),
         ([member], [0.5, 0.5], "`weights`"),
         ([member, problems.gaussian_posterior()], None, "same `x_o`"),
-        ([member, problems.gaussian_posterior(dim=3)], None, "as the first"),
+        ([member, problems.gaussian_posterior(dim=3)], None, "same shapes"),
     ):
         with pytest.raises(InvalidInputError, match=match):
             average(members, weights=weights)
@@ -112,18 +100,3 @@ def test_posteriors_with_other_priors_are_not_averaged() -> None:
     for members in ([narrow, wide], [wide, narrow]):
         with pytest.raises(InvalidInputError, match=r"posteriors\[1\]"):
             average(members)
-
-
-def test_an_average_knows_the_names_that_its_members_know() -> None:
-    first, second = single(problems.box(2)), single(problems.box(2))
-    first.x_names = second.x_names = ("u", "v", "w")
-    first.parameter_names = second.parameter_names = ("a", "b")
-    posterior = average([first, second])
-    table = pd.DataFrame([[0.0, 1.0, 2.0]], columns=["v", "u", "w"])
-    theta, x = torch.zeros(1, 2), torch.tensor([[1.0, 0.0, 2.0]])
-    found = posterior.log_prob(theta, x=table)
-    assert torch.equal(found, posterior.log_prob(theta, x=x))
-    assert not torch.equal(found, posterior.log_prob(theta, x=x[:, [1, 0, 2]]))
-    assert posterior.parameter_names == ("a", "b")
-    second.parameter_names = ("b", "a")
-    assert average([first, second]).parameter_names is None

@@ -9,7 +9,6 @@ import pytest
 import torch
 from sbi.neural_nets import posterior_nn
 from sbi.neural_nets.embedding_nets import (
-    CNNEmbedding,
     FCEmbedding,
     PermutationInvariantEmbedding,
 )
@@ -19,7 +18,7 @@ from sbi_rope._sbi import embedding_of, estimator_of, headless
 from sbi_rope.density import Flow
 from sbi_rope.ensemble import Ensemble, drawn, embedded, log_density
 from sbi_rope.fit import Training, fit
-from sbi_rope.tasks.networks import SeriesEmbedding, light_series_embedding
+from sbi_rope.tasks.networks import SeriesEmbedding
 from tests import problems
 
 ALONE: Any = {"label": "", "show_progress_bars": False}
@@ -48,28 +47,10 @@ class Recurrent(nn.Module):
         return self.gru(x)[1][0]
 
 
-class Scaled(nn.Module):
-    """Holds a parameter of its own beside layers."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.scale = nn.Parameter(torch.ones(3))
-        self.layer = nn.Linear(3, 4)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.layer(self.scale * x)
-
-
 NETS: dict[str, tuple[Callable[[], nn.Module], tuple[int, ...]]] = {
     "linear": (lambda: nn.Sequential(nn.Linear(3, 4), nn.Tanh()), (3,)),
-    "dropout": (lambda: nn.Sequential(nn.Linear(3, 4), nn.Dropout(0.5)), (3,)),
-    "own parameter": (Scaled, (3,)),
     "fully connected": (lambda: FCEmbedding(3, output_dim=4, num_hiddens=8), (3,)),
     "conv": (problems.SmallCNN, (1, 8, 8)),
-    "conv of sbi": (
-        lambda: CNNEmbedding((8, 8), output_dim=4, kernel_size=3),
-        (1, 8, 8),
-    ),
     "recurrent": (Recurrent, (5, 2)),
     "sets": (
         lambda: PermutationInvariantEmbedding(
@@ -80,7 +61,6 @@ NETS: dict[str, tuple[Callable[[], nn.Module], tuple[int, ...]]] = {
     "trials": (problems.TrialsNet, (4, 2)),
     "transposed": (Transposed, (5, 2)),
     "series": (lambda: SeriesEmbedding(num_steps=80, output_dim=4), (80,)),
-    "light": (lambda: light_series_embedding(num_steps=40, output_dim=4), (40,)),
 }
 FAMILIES = problems.FAMILIES
 

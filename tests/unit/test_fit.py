@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
-from typing import Any, cast
+from typing import Any
 
 import pytest
 import torch
@@ -11,13 +11,10 @@ from torch import Tensor, nn
 from sbi_rope.ensemble import Ensemble, embedded
 from sbi_rope.errors import RoPEWarning
 from sbi_rope.fit import (
-    EPOCHS_WITHOUT_HOLDOUT,
     Courses,
     History,
     Training,
-    differentiable,
     fit,
-    fit_on_pairs,
 )
 
 
@@ -71,44 +68,6 @@ def test_the_best_on_the_held_out_data_is_kept_and_not_the_last() -> None:
     assert towards(module, 1.0)().item() == history.kept_validation_loss
 
 
-def test_any_number_improves_on_a_start_that_is_nan() -> None:
-    module = Number()
-
-    def validation_loss() -> Tensor:
-        distance = (module.value - 3).square()
-        return distance if module.value > 0 else distance * torch.nan
-
-    history = run(module, towards(module, 3.0), validation_loss)
-    assert math.isnan(history.validation_loss[0])
-    assert history.best_epoch > 0
-    assert History([1.0], [math.nan], 0, 0.1).kept_validation_loss == math.inf
-
-
-def test_what_is_frozen_is_left_alone_unless_all_of_it_is() -> None:
-    pair = nn.ModuleList([Number(), Number()])
-    first, second = (cast(Number, one) for one in pair)
-
-    def loss() -> Tensor:
-        return towards(first, 1.0)() + towards(second, 1.0)()
-
-    first.requires_grad_(requires_grad=False)
-    run(pair, loss, None)
-    assert (first.value == 0, second.value > 0.5) == (True, True)
-    run(pair, loss, None)
-    assert first.value > 0.5
-
-
-def test_the_start_competes_and_ties_are_won_by_the_earlier() -> None:
-    def constant() -> Tensor:
-        return torch.ones(())
-
-    for held_out in (0.0, None):
-        module = Number()
-        judged = constant if held_out is None else towards(module, held_out)
-        assert run(module, towards(module, 2.0), judged).best_epoch == 0
-        assert module.value.item() == 0.0
-
-
 def test_it_stops_when_its_patience_is_at_an_end() -> None:
     module = Number()
     history = run(module, towards(module, 2), towards(module, 0.5), stop_after_epochs=4)
@@ -139,18 +98,6 @@ def test_the_steps_are_those_of_adam_with_clipped_gradients(
     # Without a hold-out the last is kept.
     assert history.best_epoch == 1
     assert history.validation_loss == []
-
-
-def test_the_mode_is_the_one_asked_for_while_it_trains() -> None:
-    for mode in (True, False):
-        module, modes = Number().train(), []
-
-        def loss(module: Number = module, modes: list[bool] = modes) -> Tensor:
-            modes.append(module.training)
-            return module.value.square()
-
-        run(module, loss, loss, max_num_epochs=1, in_training_mode=mode)
-        assert modes == [False, mode, False]
 
 
 def test_buffers_are_kept_with_the_best() -> None:
@@ -274,48 +221,3 @@ def test_a_course_that_made_the_loss_worse_is_not_kept() -> None:
 
 
 # --- pairs ---
-
-
-class Constant(nn.Module):
-    """An estimator of sbi whose loss is the distance of theta from a number."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.value = nn.Parameter(torch.zeros(1))
-
-    def loss(self, theta: Tensor, condition: Tensor) -> Tensor:
-        return (theta - self.value).square()[:, 0]
-
-
-def on_pairs(n: int, held_out: int, **options: Any) -> History:
-    theta, rows = torch.ones(n, 1), torch.arange(n)
-    return fit_on_pairs(
-        Constant(),
-        theta,
-        theta,
-        (rows[held_out:], rows[:held_out]),
-        training=Training(training_batch_size=8, **options),
-        in_training_mode=True,
-        label="Pairs",
-        show_progress_bars=False,
-    )
-
-
-def test_without_a_hold_out_it_stops_early_and_warns() -> None:
-    with pytest.warns(RoPEWarning, match="Only 1 different parameters"):
-        assert on_pairs(4, 0).best_epoch == EPOCHS_WITHOUT_HOLDOUT
-    with pytest.warns(RoPEWarning):
-        assert on_pairs(2, 0, max_num_epochs=3).best_epoch == 3
-
-
-def test_recurrent_nets_in_evaluation_mode_do_not_use_cudnn() -> None:
-    # cuDNN has no gradients for them. On a CPU only the flag can be seen.
-    before = torch.backends.cudnn.enabled
-    for net, is_off in (
-        (nn.Sequential(nn.GRU(1, 2)).eval(), True),
-        (nn.Sequential(nn.GRU(1, 2)).train(), False),
-        (nn.Linear(1, 2).eval(), False),
-    ):
-        with differentiable(net):
-            assert torch.backends.cudnn.enabled == (before and not is_off)
-        assert torch.backends.cudnn.enabled == before

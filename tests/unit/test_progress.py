@@ -46,14 +46,6 @@ def work(**show: bool) -> None:
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_without_a_terminal_no_call_shows_a_bar_by_default(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    work()
-    assert capsys.readouterr() == ("", "")
-
-
-@pytest.mark.filterwarnings("ignore")
 def test_no_call_shows_a_bar_in_a_terminal_if_it_is_asked_not_to(
     terminal: pytest.CaptureFixture[str],
 ) -> None:

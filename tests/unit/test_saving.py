@@ -15,10 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from sbi.neural_nets.embedding_nets import CNNEmbedding, PermutationInvariantEmbedding
-from sbi.utils import BoxUniform, MultipleIndependent
 from torch import Tensor, nn
-from torch.distributions import Exponential, Gamma, Independent, LogNormal
 
 from sbi_rope import MixturePosterior, StackedPosterior, load, save
 from sbi_rope.density import Flow, Mixture, PriorPosterior
@@ -147,11 +144,6 @@ def test_posteriors_of_vector_fields_can_be_saved(method: str, tmp_path: Path) -
 @pytest.mark.parametrize(
     "prior",
     [
-        BoxUniform(-torch.ones(2), torch.ones(2)),
-        Independent(LogNormal(torch.zeros(2), torch.ones(2)), 1),
-        MultipleIndependent(
-            [Gamma(torch.ones(1), torch.ones(1)), Exponential(torch.ones(1))]
-        ),
         UniformTriangle(torch.tensor(0.5)),
         PopulationPrior(),
     ],
@@ -164,74 +156,6 @@ def test_priors_can_be_saved(prior: Any, tmp_path: Path) -> None:
     loaded.set_default_x(torch.zeros(1, 3))
     found = loaded.map(num_iter=2, num_init_samples=5, num_to_optimize=2)
     assert found.isfinite().all()
-
-
-@pytest.mark.parametrize(
-    ("net", "shape"),
-    [
-        (nn.TransformerEncoderLayer(4, 2, 8, batch_first=True), (5, 4)),
-        (CNNEmbedding((16, 16), num_linear_units=4), (16, 16)),
-        (PermutationInvariantEmbedding(nn.Linear(3, 4), 4, output_dim=4), (6, 3)),
-    ],
-    ids=lambda value: type(value).__name__,
-)
-def test_networks_of_torch_and_sbi_can_be_saved(
-    net: nn.Module, shape: tuple[int, ...], tmp_path: Path
-) -> None:
-    posterior: Any = PriorPosterior(problems.box(2))
-    posterior.net = net.eval()
-    x = torch.randn(2, *shape)
-    loaded = saved_and_loaded(posterior, tmp_path).net
-    assert torch.equal(loaded(x), net(x))
-
-
-def test_attributes_keep_their_types(tmp_path: Path) -> None:
-    posterior: Any = PriorPosterior(problems.box(2))
-    values = {
-        "free": nn.Parameter(torch.ones(2)),
-        "turned": torch.randn(3, 2).mT,
-        "array": np.arange(3),
-        "number": np.float64(0.1),
-        "others": (1j, b"\0a", {1, 2}, range(3), torch.float64, {2: None}),
-        "functions": [torch.tanh, nn.functional.relu, nn.functional.gelu],
-        "partial": functools.partial(nn.functional.softmax, dim=0),
-    }
-    posterior.values = values
-    loaded = saved_and_loaded(posterior, tmp_path).values
-    for name in ("free", "turned"):
-        assert torch.equal(loaded[name], values[name])
-        assert loaded[name].stride() == values[name].stride()
-        assert type(loaded[name]) is type(values[name])
-    assert (loaded["array"] == values["array"]).all()
-    assert loaded["number"] == 0.1
-    assert loaded["others"] == values["others"]
-    assert loaded["functions"] == values["functions"]
-    assert torch.equal(loaded["partial"](torch.ones(2)), torch.full((2,), 0.5))
-
-
-@pytest.mark.medium
-def test_a_posterior_of_a_gpu_is_loaded_on_the_cpu(tmp_path: Path) -> None:
-    posterior = rope_posterior()
-    expected = numbers(posterior, posterior.x_o[:2])
-    # What sbi keeps of the device of a posterior.
-    posterior.device, posterior._device = torch.device("cuda:0"), "cuda:0"
-    posterior.potential_fn.device = "cuda:0"
-    loaded = saved_and_loaded(posterior, tmp_path)
-    found = numbers(loaded, posterior.x_o[:2])
-    assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
-    assert {str(loaded._device), str(loaded.potential_fn.device)} == {"cpu"}
-
-
-@pytest.mark.medium
-def test_the_file_of_one_observation_holds_no_other(tmp_path: Path) -> None:
-    # Whatever was asked for before.
-    posterior, x_o = rope_posterior(), stacks.observed()
-    posterior.log_prob_batched(torch.zeros(1, len(x_o), 2), x_o)
-    posterior.potential(torch.zeros(1, 2), x_o[7])
-    assert_same(posterior[3], saved_and_loaded(posterior[3], tmp_path), x_o[3:4])
-    written = (tmp_path / "posterior.pt").read_bytes()
-    assert x_o[3].numpy().tobytes() in written
-    assert not any(x.numpy().tobytes() in written for x in x_o[4:])
 
 
 # --- what is refused ---
@@ -361,20 +285,6 @@ def test_classes_of_the_user_have_to_be_trusted(tmp_path: Path) -> None:
     for wrong in (["tests.OwnNet"], [OwnNet()]):
         with pytest.raises(InvalidInputError, match="trusted"):
             load(tmp_path / "posterior.pt", trusted=wrong)  # type: ignore[arg-type]
-
-
-def test_a_class_of_a_notebook_is_found_in_the_module_it_moved_to(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    posterior: Any = PriorPosterior(problems.box(2))
-    posterior.net = OwnNet()
-    with monkeypatch.context() as patch:
-        patch.setattr(OwnNet, "__module__", "__main__")
-        patch.setattr(sys.modules["__main__"], "OwnNet", OwnNet, raising=False)
-        save(posterior, tmp_path / "x.pt")
-    with pytest.raises(FileFormatError, match=r"__main__\.OwnNet"):
-        load(tmp_path / "x.pt")
-    assert type(load(tmp_path / "x.pt", trusted=[OwnNet]).net) is OwnNet
 
 
 # --- files ---

@@ -1,7 +1,6 @@
 """What the package takes from sbi's estimators, and what it refuses."""
 
 import copy
-import re
 from typing import Any
 
 import pytest
@@ -11,12 +10,10 @@ from sbi.inference import (
     DirectPosterior,
     EnsemblePosterior,
     MCMCPosterior,
-    VectorFieldPosterior,
 )
 from sbi.inference.posteriors import NPE_A_Posterior
 from sbi.inference.posteriors.filtered_direct_posterior import FilteredDirectPosterior
 from sbi.neural_nets import likelihood_nn
-from sbi.neural_nets.estimators.tabpfn_flow import TabPFNFlow
 from sbi.utils import RestrictedPrior, get_density_thresholder
 from torch import nn
 from torch.distributions import Categorical, MixtureSameFamily, MultivariateNormal
@@ -28,11 +25,9 @@ from sbi_rope._sbi import (
     estimator_of,
     gaussians_of,
     headless,
-    posterior_from,
     with_embedding,
 )
 from sbi_rope.errors import UnsupportedPosteriorError
-from sbi_rope.trainers import FinetunedNPE
 from tests import problems
 
 
@@ -89,47 +84,6 @@ def test_npe_without_a_prior_is_asked_for_it() -> None:
     RoPE(npe.build_posterior(prior=problems.box(2)), simulator=problems.simulate)
 
 
-def test_networks_whose_training_has_failed_are_refused() -> None:
-    posterior = copy.deepcopy(problems.npe_posterior())
-    [*_, (name, last)] = posterior.posterior_estimator.named_parameters()
-    last.data.flatten()[0] = torch.nan
-    match = f"NaN or Inf in `{re.escape(name)}`"
-    for wrap in (
-        lambda: RoPE(posterior, simulator=problems.simulate),
-        lambda: FinetunedNPE.from_posterior(posterior),
-    ):
-        with pytest.raises(UnsupportedPosteriorError, match=match):
-            wrap()
-
-
-def test_an_estimator_that_was_not_trained_is_refused_by_name() -> None:
-    # `NPE_PFN(...).build_posterior(sample_with="direct")`, without its dependency.
-    posterior = bare(DirectPosterior)
-    posterior.posterior_estimator = flow = bare(TabPFNFlow)
-    nn.Module.__init__(flow)
-    with pytest.raises(UnsupportedPosteriorError, match="got TabPFNFlow"):
-        RoPE(posterior, simulator=problems.simulate)
-
-
-def test_a_mixed_estimator_with_two_embedding_nets_is_refused() -> None:
-    posterior = copy.deepcopy(problems.npe_posterior("mnpe", dim=1))
-    discrete = posterior.posterior_estimator.discrete_net.net
-    discrete.embedding_net = copy.deepcopy(discrete.embedding_net)
-    with pytest.raises(UnsupportedPosteriorError, match="share one embedding net"):
-        RoPE(posterior, simulator=problems.simulate)
-
-
-def test_an_estimator_without_embedding_net_is_refused_by_name() -> None:
-    with pytest.raises(UnsupportedPosteriorError, match="Gaussians"):
-        embedding_of(problems.Gaussians(2))
-
-
-def test_an_embedding_that_is_not_a_vector_is_refused() -> None:
-    estimator = with_embedding(fresh_estimator(), nn.Unflatten(1, (1, 3)))
-    with pytest.raises(UnsupportedPosteriorError, match="one vector per observation"):
-        headless(estimator)
-
-
 def test_with_embedding_shares_all_other_parameters() -> None:
     estimator = fresh_estimator()
     old = {id(p) for p in embedding_of(estimator).parameters()}
@@ -158,16 +112,6 @@ def test_embed_does_not_depend_on_the_batch() -> None:
     assert torch.allclose(embed(net, x, batch_size=3), whole, atol=1e-6)
     assert torch.allclose(embed(net, x[4:5]), whole[4:5], atol=1e-6)
     assert not whole.requires_grad
-
-
-@pytest.mark.parametrize("sample_with", ["ode", "sde"])
-def test_posterior_from_keeps_how_a_vector_field_is_sampled(sample_with: str) -> None:
-    # Deeply, as shallow copies of sbi's posteriors share their attributes.
-    original = copy.deepcopy(problems.vector_field_posterior("npse"))
-    original.sample_with = sample_with
-    posterior = posterior_from(original, original.vector_field_estimator)
-    assert type(posterior) is VectorFieldPosterior
-    assert posterior.sample_with == sample_with
 
 
 def test_the_gaussians_of_a_mixture_density_network_have_its_density() -> None:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 
@@ -23,8 +22,6 @@ from sbi_rope.settings import (
     Settings,
     UnitInterval,
     check,
-    default_names,
-    names_of,
     one_of,
 )
 from tests.refusals import assert_refused
@@ -93,11 +90,3 @@ def test_a_class_of_settings_checks_its_fields_and_those_of_its_base() -> None:
     assert_refused("`width`.*above 0; got 0", Kernels, 0)
     assert_refused("`solver`.*got 'x'", Kernels, 0.5, "x")
     assert_refused("`num_steps`.*got 0", Kernels, 0.5, num_steps=0)
-
-
-def test_names_are_as_many_as_parameters_and_all_different() -> None:
-    assert default_names(2) == ("theta_1", "theta_2")
-    for value in (["a", "b"], ("a", "b"), np.array(["a", "b"]), pd.Index(["a", "b"])):
-        assert names_of(value, 2) == ("a", "b")
-    for bad in ("ab", None, 3, ["a"], ["a", "a"], ["a", "b", "c"]):
-        assert_refused("`parameter_names` to be 2 different names", names_of, bad, 2)

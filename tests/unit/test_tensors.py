@@ -1,6 +1,5 @@
 """Data of a user become tensors of the expected shape, or are refused."""
 
-import re
 from typing import Any
 
 import numpy as np
@@ -55,12 +54,6 @@ def test_what_holds_no_real_numbers_is_refused() -> None:
         assert_refused(match, as_numbers, "x", value, error=InvalidInputError)
 
 
-def test_a_change_of_the_result_does_not_change_the_array_of_the_user() -> None:
-    array = np.ones((3, 2), dtype=np.float32)
-    as_batch("x", array, (2,)).zero_()
-    assert array.all()
-
-
 def test_masked_numbers_and_missing_ones_of_a_table_are_nan() -> None:
     masked = np.ma.masked_equal([[1, -9], [3, 4]], -9)
     frame = pd.DataFrame({"a": [1.0, 3.0], "b": pd.array([None, 4], dtype="Float64")})
@@ -70,22 +63,6 @@ def test_masked_numbers_and_missing_ones_of_a_table_are_nan() -> None:
         assert_refused(
             r"NaN or Inf in 1 of 2 rows \(first: \[0\]\)", as_batch, "x", value
         )
-
-
-@pytest.mark.parametrize(
-    ("shape", "event", "hint"),
-    [
-        ((8, 6), (8, 6), "x[None]"),
-        ((5,), (1,), "x[:, None]"),
-        ((5, 48), (1, 8, 6), "x.reshape(-1, 1, 8, 6)"),
-    ],
-)
-def test_the_hint_mends_the_shape(
-    shape: tuple[int, ...], event: tuple[int, ...], hint: str
-) -> None:
-    x = torch.zeros(shape)
-    assert_refused(re.escape(f"pass `{hint}`"), as_batch, "x", x, event)
-    as_batch("x", eval(hint, {"x": x}), event)
 
 
 def test_parameters_outside_the_prior_are_counted() -> None:
