@@ -139,8 +139,8 @@ class Method(ABC):
     another one, which starts anew. ``train`` and what appends return the method, so
     that calls can be chained. Of data that do not fit nothing is added.
 
-    A subclass says which data it ``sees`` and returns a posterior from ``_fit``. Options
-    that a method has no use for raise a ``TypeError``.
+    A subclass says which data it ``sees`` and returns a posterior from ``_fit``.
+    Options that a method has no use for raise a ``TypeError``.
 
     Attributes:
         sees: The kinds of data that can be appended.
