@@ -29,7 +29,7 @@ class Settings:
         finetuner: Settings of the fine-tuning of RoPE.
         own_training: How methods are trained whose papers, or whose goals, ask for a
             training of their own; None for that.
-        num_folds: Folds of the pairs of a stack; None for its own number.
+        num_folds: Folds of the pairs of a stack.
     """
 
     num_simulations: int
@@ -42,7 +42,7 @@ class Settings:
     flow_options: dict[str, Any] = field(default_factory=lambda: {"num_transforms": 2})
     finetuner: CalibrationFinetuner = field(default_factory=CalibrationFinetuner)
     own_training: Training | None = None
-    num_folds: int | None = None
+    num_folds: int = 5
 
     def builder(self, task: Task) -> Any:
         """Return the builder of untrained estimators."""

@@ -257,40 +257,6 @@ def _fall(losses: Sequence[float], length: int) -> float:
     return sum(third) / quarter - sum(fourth) / quarter
 
 
-def fit_on_pairs(
-    estimator: Any,
-    theta: Tensor,
-    x: Tensor,
-    split: tuple[Tensor, Tensor],
-    *,
-    training: Training,
-    in_training_mode: bool,
-    label: str,
-    show_progress_bars: bool,
-) -> History:
-    """Train an estimator on the pairs of a split that are not held out, in place."""
-    train, held_out = split
-
-    def batches(epoch: int) -> Iterator[tuple[Tensor]]:
-        return zip(shuffled(train, training.training_batch_size), strict=True)
-
-    def loss(rows: Tensor) -> Tensor:
-        return estimator.loss(theta[rows], condition=x[rows]).mean()
-
-    [history] = fit(
-        estimator,
-        batches,
-        loss,
-        training,
-        validation_loss=(lambda: loss(held_out)) if len(held_out) else None,
-        max_num_epochs=epochs_on_pairs(theta, held_out, training.max_num_epochs),
-        in_training_mode=in_training_mode,
-        label=label,
-        show_progress_bars=show_progress_bars,
-    )
-    return history
-
-
 class _Adam:
     """Adam with a step size, and a limit on the gradient's norm, for each member.
 

@@ -16,7 +16,7 @@ from sbi_rope.data import split_groups, split_pairs
 from sbi_rope.density import MixturePosterior
 from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.errors import InvalidInputError
-from sbi_rope.fit import fit_on_pairs
+from sbi_rope.fit import epochs_on_pairs, fit, shuffled
 from sbi_rope.tasks import get_task
 
 pytestmark = pytest.mark.filterwarnings("ignore:Maximum number of epochs")
@@ -75,12 +75,20 @@ def networks(method: FinetunedNPE, pairs: tuple[Tensor, Tensor] = TEST) -> Tenso
 def test_with_one_holdout_it_is_one_network_tuned_on_the_rest() -> None:
     method = finetuned(npe(), num_holdouts=1)
     estimator = copy.deepcopy(npe().posterior_estimator).requires_grad_()
+    theta, x = PAIRS
+
+    def loss(rows: Tensor) -> Tensor:
+        return estimator.loss(theta[rows], condition=x[rows]).mean()
+
     with seeded(0):
-        history = fit_on_pairs(
+        train, held_out = split_pairs(theta, 0.2)
+        [history] = fit(
             estimator,
-            *PAIRS,
-            split_pairs(PAIRS[0], 0.2),
-            training=SHORT,
+            lambda _: zip(shuffled(train, SHORT.training_batch_size), strict=True),
+            loss,
+            SHORT,
+            validation_loss=lambda: loss(held_out),
+            max_num_epochs=epochs_on_pairs(theta, held_out, SHORT.max_num_epochs),
             in_training_mode=False,
             label="",
             show_progress_bars=False,
