@@ -2,6 +2,7 @@ r"""The distribution of parameters, learned from those of the calibration pairs.
 
 import math
 from dataclasses import dataclass
+from statistics import fmean
 
 import numpy as np
 import torch
@@ -19,11 +20,9 @@ __all__ = [
     "probability_of_prior",
 ]
 
-# Draws of the prior that the parameters of pairs are compared with.
-NUM_FROM_PRIOR = 10_000
-
-# Draws of each label that is not exact.
-NUM_SETS = 10
+# Draws of the prior that the parameters of pairs are compared with, and draws of each
+# label that is not exact.
+NUM_FROM_PRIOR, NUM_SETS = 10_000, 10
 # The prior's mean and covariance count as much as this number of pairs. The results are
 # averaged, weighted by their evidence.
 STRENGTHS = (2.0, 5.0, 10.0, 30.0, 100.0)
@@ -68,26 +67,24 @@ def learn_parameters(
         \Lambda \sim \mathrm{IW}(c\, R, c + d + 1), \quad
         \mu \mid \Lambda \sim \mathcal N(0, \Lambda / c),
 
-    averaged over values of c by their evidence. The alternative is that real parameters
-    follow the prior, with a probability of one half before any pair is seen and
-    :math:`\pi` afterwards. The predictive density of the model is a mixture t(u) of
-    Student t densities, and simulations from the prior are drawn with probabilities
-    proportional to
+    averaged over values of c by their evidence, so that the predictive density is a
+    mixture t(u) of Student t densities. The alternative is that real parameters follow
+    the prior, with a probability of one half before any pair is seen and :math:`\pi`
+    afterwards. Simulations from the prior are drawn with probabilities proportional to
 
     .. math::
         \pi + (1 - \pi)\, t(u) / \mathcal N(u; 0, R) .
 
     Discrete parameters, of which more than one in twenty simulations share a value, are
-    left out: they stay distributed as in the prior, given the others.
-    Scores of pairs are cut off where only one of twenty sets of pairs from the prior
-    reaches, so that labels on a bound do not count for more with more simulations.
+    left out: they stay distributed as in the prior, given the others. Scores of pairs
+    are cut off where one of twenty sets of pairs from the prior reaches, so that labels
+    on a bound do not count for more with more simulations.
 
     Args:
-        theta_cal: Parameters of the pairs, shape ``(n_c, d)``. Parameters that appear
-            more than once count once, because several recordings of one person are one
-            draw from the distribution. Of labels that are not exact, R draws of the
-            parameters of each, shape ``(n_c, R, d)``. The probabilities are then
-            averages over up to ten sets of draws.
+        theta_cal: Parameters of the pairs, shape ``(n_c, d)``. Equal ones count once,
+            because several recordings of one person are one draw from the distribution.
+            Of labels that are not exact, R draws of each, shape ``(n_c, R, d)``. The
+            probabilities are then averages over up to ten sets of draws.
         theta: Parameters of at least two simulations from the prior, shape ``(n, d)``.
         weights: How many draws from the distribution each pair counts as, shape
             ``(n_c,)``; one if None. The weights of equal parameters are added.
@@ -98,16 +95,17 @@ def learn_parameters(
     if weights is not None:
         weights = as_batch("weights", weights, (), rows=len(theta_cal))
         weights = weights.to(theta_cal.device, torch.double)
-    is_continuous = [not _is_discrete(column) for column in theta.T]
-    if not any(is_continuous):
-        uniform = theta.new_full((len(theta),), 1.0 / len(theta), dtype=torch.double)
+    most = torch.stack([one.unique(return_counts=True)[1].max() for one in theta.T])
+    is_continuous = most <= max(1.0, MAX_SHARE * len(theta))
+    uniform = theta.new_full((len(theta),), 1.0 / len(theta), dtype=torch.double)
+    if not is_continuous.any():
         return ParameterDistribution(probabilities=uniform, probability_of_prior=0.5)
     sets = theta_cal.unbind(dim=1)[:NUM_SETS] if theta_cal.ndim == 3 else [theta_cal]
     parts = [_learn(draws, theta, weights, is_continuous) for draws in sets]
-    of_prior = [part.probability_of_prior for part in parts]
+    mixed = [p * uniform + (1.0 - p) * ratio for p, ratio in parts]
     return ParameterDistribution(
-        probabilities=torch.stack([part.probabilities for part in parts]).mean(dim=0),
-        probability_of_prior=sum(of_prior) / len(of_prior),
+        probabilities=torch.stack(mixed).mean(dim=0),
+        probability_of_prior=fmean(p for p, _ in parts),
     )
 
 
@@ -119,21 +117,15 @@ def probability_of_prior(pairs: Pairs, prior: Distribution, *, seed: int = 0) ->
     return learn_parameters(pairs.theta, theta, weights=weights).probability_of_prior
 
 
-def _is_discrete(column: Tensor) -> bool:
-    """Tell whether many draws of a parameter share a value."""
-    _, counts = column.unique(return_counts=True)
-    most = int(counts.max())
-    return most > 1 and most > MAX_SHARE * len(column)
-
-
 def is_improbable(probability_of_prior: float | None) -> bool:
     """Tell whether the parameters of pairs are hardly draws from the prior."""
     return probability_of_prior is not None and probability_of_prior < IMPROBABLE
 
 
 def _learn(
-    theta_cal: Tensor, theta: Tensor, weights: Tensor | None, is_continuous: list[bool]
-) -> ParameterDistribution:
+    theta_cal: Tensor, theta: Tensor, weights: Tensor | None, is_continuous: Tensor
+) -> tuple[float, Tensor]:
+    """Return the probability of the prior, and those of simulations without it."""
     # People who differ in a discrete parameter only are different people.
     theta_cal, place = theta_cal.unique(dim=0, return_inverse=True)
     counts = torch.ones(len(theta_cal), dtype=torch.double, device=theta_cal.device)
@@ -153,18 +145,12 @@ def _learn(
     probability = float(torch.sigmoid(counts @ normal.log_prob(u_cal) - average))
     predictive = torch.stack([log_t for _, log_t in fits], dim=1)
     log_t = (predictive + evidence.log_softmax(dim=0)).logsumexp(dim=1)
-    ratio = torch.softmax(log_t - normal.log_prob(u), dim=0)
-    uniform = torch.full_like(ratio, 1.0 / len(ratio))
-    return ParameterDistribution(
-        probabilities=probability * uniform + (1.0 - probability) * ratio,
-        probability_of_prior=probability,
-    )
+    return probability, torch.softmax(log_t - normal.log_prob(u), dim=0)
 
 
 def normal_scores(theta: Tensor, reference: Tensor) -> Tensor:
-    """Map each parameter to the normal quantile of its rank in a reference sample.
+    """Map parameters ``(m, d)`` to normal quantiles of their ranks among a reference.
 
-    Parameters ``(m, d)`` and draws from the prior ``(n, d)`` to float64 ``(m, d)``.
     Equal values get the middle of their ranks.
     """
     ordered = reference.double().T.contiguous().sort(dim=1).values
@@ -179,12 +165,12 @@ def _fit(
     u_cal: Tensor, u: Tensor, counts: Tensor, correlation: Tensor, strength: float
 ) -> tuple[Tensor, Tensor]:
     """Return the log evidence at one strength, and the log predictive density at u."""
+    # These are the conjugate formulas for a normal distribution with unknown mean and
+    # covariance.
     n, d = float(counts.sum()), u_cal.shape[1]
     degrees, scale = strength + d + 1, strength * correlation
     average = counts @ u_cal / n
     centred = u_cal - average
-    # These are the conjugate formulas for a normal distribution with unknown mean and
-    # covariance.
     total = strength + n
     new_degrees = degrees + n
     new_scale = scale + centred.T @ (counts[:, None] * centred)

@@ -9,7 +9,11 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope._random import seeded
-from sbi_rope.discrepancy.posterior import DiscrepancyDraws, noise_scale
+from sbi_rope.discrepancy.posterior import (
+    SMALLEST_ERROR,
+    DiscrepancyDraws,
+    noise_scale,
+)
 from sbi_rope.errors import warn_user
 from sbi_rope.fit import Training, fit
 from sbi_rope.simulate import Moments
@@ -22,8 +26,6 @@ NUM_COMPONENTS, NUM_FITTED = 25, 8000
 # the gain. Centre of the standard deviations of the error, whose logarithms have the
 # standard deviation one.
 OFFSET, DIAGONAL, OFF_DIAGONAL, ERROR = 0.3, 0.3, 0.1, 0.3
-# The smallest standard deviation of the error, as for a discrepancy of x.
-SMALLEST_ERROR = 0.003
 # The search for the mode, and how far below it the result may be, in nats.
 SEARCH = Training(learning_rate=3e-2, max_num_epochs=200)
 TOLERANCE = 0.1
@@ -51,19 +53,12 @@ class Marginal(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LaplaceDiscrepancy:
-    """A normal approximation of the posterior of gain, offset and error.
+    """A normal approximation of the posterior of gain, offset and error."""
 
-    Attributes:
-        mode: The mode, in standard deviations of the prior, shape ``(P,)``.
-        root: A root of the covariance, shape ``(P, P)``.
-        scale: The diagonal of D, see :class:`DiscrepancyModel`, shape ``(l,)``.
-        below: How far the log posterior at ``mode`` is below its maximum, in nats.
-    """
-
-    mode: Tensor
-    root: Tensor
-    scale: Tensor
-    below: float
+    mode: Tensor  # in standard deviations of the prior, (P,)
+    root: Tensor  # of the covariance, (P, P)
+    scale: Tensor  # the diagonal of D, see DiscrepancyModel, (l,)
+    below: float  # how far the log posterior is below its maximum, in nats
 
     def sample(
         self, num_draws: int, *, smallest_error: float, seed: int | None = None
@@ -71,9 +66,8 @@ class LaplaceDiscrepancy:
         """Draw gains, offsets and errors, see :meth:`Discrepancy.sample`."""
         with seeded(seed):
             normal = torch.randn(num_draws, len(self.mode)).to(self.mode)
-        gain, offset, factor = _unpacked(
-            self.mode + normal @ self.root.T, len(self.scale)
-        )
+        values = self.mode + normal @ self.root.T
+        gain, offset, factor = _unpacked(values, len(self.scale))
         smallest = (smallest_error * self.scale).square().diag()
         factor = torch.linalg.cholesky(factor @ factor.mT + smallest)
         return DiscrepancyDraws(gain=gain, offset=offset, error_factor=factor)
@@ -101,17 +95,9 @@ def fit_unlabelled(
     mode is searched from that of the labels alone, and its Hessian gives the covariance
     (Laplace's approximation). All quantities are in standard deviations of simulations.
 
-    Args:
-        z: The real observations of the pairs, shape ``(n, l)``.
-        moments: Those of simulations at the exact labels of the pairs.
-        weights: How many pairs each counts as in each of E versions, ``(E, n)``. Those
-            of weight zero are not seen.
-        z_o: Observations without labels, shape ``(n_o, l)``.
-        marginal: The mixture.
-        show_progress_bars: Whether to show the search.
-
-    Returns:
-        One for each version.
+    Real observations z with exact labels have the shape ``(n, l)``, and z_o without
+    labels ``(n_o, l)``. Each of E versions has weights, ``(E, n)``, and does not see
+    those of weight zero.
     """
     z_o, width, count = z_o.double(), z.shape[1], len(weights)
     seen = (weights > 0)[..., None]
@@ -122,7 +108,7 @@ def fit_unlabelled(
     )
     share = (weights / weights.sum(dim=1, keepdim=True))[..., None, None]
     scale = noise_scale((share * covariance).sum(dim=1))
-    smallest = torch.diag_embed((SMALLEST_ERROR * scale).square())
+    smallest = torch.diag_embed((SMALLEST_ERROR["input"] * scale).square())
 
     def loss(at: Tensor, *, unlabelled: bool = True) -> Tensor:
         gain, offset, factor = _unpacked(at, width)
@@ -175,8 +161,7 @@ def _polished(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the modes, roots of the covariances, and how far below the modes we are.
 
-    The Hessians are differences of gradients. They serve several steps of Newton's
-    method.
+    Each Hessian, of differences of gradients, serves several steps of Newton's method.
     """
 
     def gradient(values: Tensor) -> Tensor:

@@ -11,7 +11,6 @@ from sbi_rope.diagnosis.report import (
     why_expected,
 )
 from sbi_rope.discrepancy import DiscrepancyReport
-from sbi_rope.discrepancy.report import what_groups_count_as, what_outliers_mean
 from sbi_rope.metrics import CoverageCurve
 from sbi_rope.metrics.calibration import (
     acauc_of,
@@ -210,21 +209,7 @@ def discrepancy_section(report: DiscrepancyReport) -> str:
         ),
         picture(discrepancy(report), caption="The same as a picture.", wide=True),
     ]
-    if counted := what_groups_count_as(report):
-        parts.append(paragraph(counted))
-    outliers = sorted({row for summary in report.summaries for row in summary.outliers})
-    if outliers:
-        meaning = what_outliers_mean(len(outliers), report.num_pairs)
-        parts.append(
-            paragraph(
-                "These calibration pairs do not fit the others (rows, from 0): "
-                f"{', '.join(map(str, outliers))}. {meaning}"
-            )
-        )
-    if report.constant:
-        parts.append(
-            paragraph(f"The same in all simulations: {', '.join(report.constant)}.")
-        )
+    parts += [paragraph(note) for note in report.notes]
     return section("Where the simulator differs from reality", *parts)
 
 
