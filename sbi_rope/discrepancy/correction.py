@@ -46,11 +46,9 @@ Space = Literal["embedding", "input", "tuned"]
 # draws simulations, which are equal if None.
 Version = tuple[Discrepancy | LaplaceDiscrepancy, Tensor | None]
 
-# The number of draws of the discrepancy for a training, and the limit on the entries of
-# all draws together. Embeddings of a hundred dimensions get fewer draws.
-NUM_DRAWS, MAX_ENTRIES = 2000, 2**24
-# Where this limits the draws, each of them serves so many simulations of a step.
-BLOCK = 40
+# Draws of the discrepancy for a training, and the limit on the entries of all together.
+# Where it limits the draws, each of them serves a block of simulations of a step.
+NUM_DRAWS, MAX_ENTRIES, BLOCK = 2000, 2**24, 40
 # A discrepancy of more entries takes minutes and many GB of memory.
 MOST_ENTRIES = 500
 # More standard deviations than this refute that the simulator is right.
@@ -71,9 +69,7 @@ NUM_COMPARED = 1920
 # Without an embedding net it adds nothing. Chosen on calibration data, see
 # benchmarks/choices.md.
 COURSES = Courses(min_gain=0.01)
-IN_A_STACK = Courses(min_gain=0.01, min_fall=0.3, max_num=2, growth=4)
-IN_A_STACK_OF_INPUT = replace(IN_A_STACK, growth=2)
-IN_A_STACK_WITHOUT_NET = replace(IN_A_STACK, max_num=1)
+IN_A_STACK = Courses(min_gain=0.01, min_fall=0.3, max_num=2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,10 +198,8 @@ def surprise(
     would have the mean :math:`E_i = \operatorname{tr}(C^{-1} C_i)` and, if it were
     Gaussian, the variance :math:`V_i = 2 \operatorname{tr}((C^{-1} C_i)^2)`. Here C is
     the mean of all :math:`C_i`. In the worst case, pairs of a group have everything in
-    common, so that each group counts as one pair, with the means of its T, E and V.
-
-    The means :math:`m_i` have the shape ``(n, R, l)``, and the nearest of R counts. The
-    covariances :math:`C_i` have the shape ``(n, l, l)``.
+    common, so that each group counts as one pair, with the means of its T, E and V. Of
+    several possible means, ``(n, R, l)``, the nearest counts.
     """
     covariances = covariances + rounding(covariances.mean(dim=0)).diag()
     residual = z.to(covariances)[:, None] - means
@@ -241,14 +235,11 @@ def correct_flow(
         \bigl[-\log q(\theta \mid A z_s + b + e)\bigr]
 
     The optimum is the posterior with the discrepancy integrated out. Every step draws
-    new rows, new corrections and new errors. A network of usual size does not overfit
-    them, so that no simulations are held out. With ``space="tuned"`` the caller puts a
-    tuned net and the constants in the place of h.
-
-    Simulations are parameters from the prior, ``(n_s, d)``, and the representation of a
-    simulation of each, ``(n_s, l)``. With ``space="input"`` all of NPE is trained,
-    otherwise the density alone, for ``num_steps`` or in courses. In a stack there are
-    many copies, which stop earlier.
+    new rows, corrections and errors, so that no simulations are held out. With
+    ``space="input"`` all of NPE is trained, otherwise the density alone, for
+    ``num_steps`` or in courses, which end earlier in a stack. With ``"tuned"`` the
+    caller puts a tuned net and the constants in the place of h. Simulations are
+    parameters from the prior and representations, ``(n_s, d)`` and ``(n_s, l)``.
     """
     theta, z = simulations
     unit = Standardisation(z.double())
@@ -293,9 +284,9 @@ def correct_flow(
     training = TRAINING[space]
     courses = Courses(math.inf) if num_steps else COURSES
     if in_a_stack:
-        courses = IN_A_STACK_OF_INPUT if space == "input" else IN_A_STACK
+        courses = replace(IN_A_STACK, growth=2 if space == "input" else 4)
         if not has_parameters(embedding_of(estimator)):
-            courses = IN_A_STACK_WITHOUT_NET
+            courses = replace(courses, max_num=1)
     histories = fit(
         network,
         lambda step: [batch(training.training_batch_size)],

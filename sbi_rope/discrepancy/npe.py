@@ -142,9 +142,7 @@ class DiscrepancyNPE(Method):
         """Compare simulations with real observations, summary by summary.
 
         The method need not be trained, and with a simulator it needs no appended
-        simulations. The report is about x itself, whatever ``space`` is. Pairs with
-        equal parameters are taken for recordings of one person, whose errors may be
-        correlated. Print it.
+        simulations. The report is about x itself, whatever ``space`` is.
 
         Args:
             summaries: A function from observations ``(n, *event)`` to a few summaries

@@ -171,9 +171,13 @@ def as_density(own: Any, data: StackData, name: str) -> Density:
     return own
 
 
-# What the data need for a correction, in words.
-NEEDS: dict[Space | None, str] = {
-    None: "3 folds",
+# What a correction is called, and what the data need for it, in words.
+NAMES: dict[Space, str] = {
+    "embedding": "discrepancy",
+    "input": "discrepancy (input)",
+    "tuned": "discrepancy (tuned)",
+}
+NEEDS: dict[Space, str] = {
     "embedding": "",
     "input": "short x without NaN, and an embedding net",
     "tuned": "long x, 3 folds",
@@ -212,8 +216,6 @@ class DiscrepancyCandidate(CorrectingCandidate):
         space: What is corrected: the embedding h(x), the input x, or the embedding
             by tuned nets.
         learn_prior: Whether the distribution of parameters is learned from the pairs.
-            The scores of a stack assume in any case that the pairs are drawn like the
-            observations to be inferred.
     """
 
     family = "discrepancy"
@@ -222,8 +224,7 @@ class DiscrepancyCandidate(CorrectingCandidate):
         check("space", space, Space)
         check("learn_prior", learn_prior, bool)
         self.space, self.learns_prior, self.needs = space, learn_prior, NEEDS[space]
-        self.name = _named("discrepancy", space)
-        self.name += "" if learn_prior else ", given prior"
+        self.name = NAMES[space] + ("" if learn_prior else ", given prior")
 
     def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
         """Train NPE on corrected simulations."""
@@ -233,10 +234,6 @@ class DiscrepancyCandidate(CorrectingCandidate):
         # Other spaces have the same flow for all parts of a version.
         several = None if self.space == "tuned" else 1
         return [flow[numbers[:several]] for numbers in members]
-
-
-def _named(name: str, space: Space | None) -> str:
-    return name if space in (None, "embedding") else f"{name} ({space})"
 
 
 def corrected(
@@ -338,25 +335,20 @@ def started(
     *,
     learn_prior: bool = True,
 ) -> tuple[Flow, list[list[int]]]:
-    """Return NPE, corrected or not, for each part of each version, and their numbers.
-
-    Where nothing is held out, the version is a single part.
-    """
+    """Return NPE, corrected or not, for each part of each version; their numbers."""
     parts = [_seen(rows, data) for rows in versions]
     of_version = [version for version, some in enumerate(parts) for _ in some]
+    numbers = _numbers(of_version, len(versions))
     if space is None:
-        flow = Flow.of([data.estimator]).made_of([(0, 0)] * len(of_version))
-    else:
-        found = corrected(data, versions, space, learn_prior=learn_prior)
-        flow = found.flow
-        if space == "tuned":
-            nets = tuned(data, versions)
-            numbers = [number for rows in versions for number in nets.of(rows, data)]
-            members = list(zip(numbers, of_version, strict=True))
-            flow = flow.made_of(members, nets.nets.then(found.constants))
-        else:
-            flow = flow[of_version]
-    return flow, _numbers(of_version, len(versions))
+        flow = Flow.of([data.estimator])
+        return flow.made_of([(0, 0)] * len(of_version)), numbers
+    found = corrected(data, versions, space, learn_prior=learn_prior)
+    if space != "tuned":
+        return found.flow[of_version], numbers
+    nets = tuned(data, versions)
+    of_nets = [number for rows in versions for number in nets.of(rows, data)]
+    members = list(zip(of_nets, of_version, strict=True))
+    return found.flow.made_of(members, nets.nets.then(found.constants)), numbers
 
 
 def _numbers(of_version: Sequence[int], count: int) -> list[list[int]]:
@@ -370,12 +362,9 @@ def _numbers(of_version: Sequence[int], count: int) -> list[list[int]]:
 # How NPE is fine-tuned. Behind a corrected x all parameters were trained already, and a
 # smaller rate is enough. Chosen on calibration data, see benchmarks/choices.md.
 LEARNING_RATE, LEARNING_RATE_OF_INPUT = 1e-3, 3e-4
-# Training with rehearsal stops after so many epochs without improvement. No other
-# number was tried. What it gains on calibration data is in benchmarks/choices.md.
-REHEARSED = replace(FINETUNING, stop_after_epochs=10)
-# Pairs with different parameters. On calibration data it was worse than fine-tuned NPE
-# with 50, and better with 200; nothing between was tried.
-MIN_TO_REHEARSE = 100
+# With rehearsal, and pairs with different parameters that it needs: on calibration data
+# it was worse than fine-tuned NPE with 50, and better with 200.
+REHEARSED, MIN_TO_REHEARSE = replace(FINETUNING, stop_after_epochs=10), 100
 
 
 class FinetunedCandidate(CorrectingCandidate):
@@ -397,17 +386,14 @@ class FinetunedCandidate(CorrectingCandidate):
     def __init__(self, *, space: Space | None = None, rehearse: bool = False) -> None:
         check("space", space, Space | None)
         check("rehearse", rehearse, bool)
-        self.space, self.rehearse, self.needs = space, rehearse, NEEDS[space]
-        self.family = "fine-tuned NPE"
-        self.name = self.family
+        self.space, self.rehearse = space, rehearse
+        self.name = self.family = "fine-tuned NPE"
+        self.needs = f"{MIN_TO_REHEARSE} pairs, long x" if rehearse else "3 folds"
         if space is not None:
             self.family = "discrepancy, fine-tuned"
-            self.name = f"{_named('discrepancy', space)}, fine-tuned"
-        if space == "embedding":
-            self.needs = "long x"
-        if rehearse:
-            self.name += ", rehearsed"
-            self.needs = f"{MIN_TO_REHEARSE} pairs, long x"
+            self.name = f"{NAMES[space]}, fine-tuned"
+            self.needs = NEEDS[space] or "long x"
+        self.name += ", rehearsed" if rehearse else ""
 
     def suits(self, data: StackData) -> bool:
         """Tell whether there are parts to hold out, and the starting NPE applies.
@@ -518,19 +504,16 @@ MIN_OBSERVATIONS, MAX_OBSERVATIONS, MAX_ENTRIES = 30, 200, 10
 class UnlabelledCandidate(CorrectingCandidate):
     """NPE trained on corrected simulations, as learned from unlabelled x, too.
 
-    The density of an observation without label is closed for a Gaussian mixture of
-    simulations, see ``sbi_rope.discrepancy.unlabelled``. It assumes that the parameters
-    of the observations follow the prior. The labels decide about its weight.
+    It assumes that the parameters of the observations follow the prior, see
+    ``sbi_rope.discrepancy.unlabelled``. The labels decide about its weight.
 
     Args:
-        x_o: Real observations, shape ``(n_o, l)``. The stack may be asked about these
-            or about others. The observations of the calibration pairs should not be
-            among them, so that the scores are those of new observations. If there are
-            more than 200, so many are drawn.
+        x_o: Real observations, shape ``(n_o, l)``, of which up to 200 are used. Those
+            of the calibration pairs should not be among them, so that the scores are
+            those of new observations. The stack may be asked about others, too.
 
     Raises:
-        InvalidInputError: If x_o holds no numbers. Shape and values of x_o are checked
-            when the stack is made.
+        InvalidInputError: If x_o holds no numbers. Its shape is checked in the stack.
     """
 
     name = "discrepancy, with x_o"
@@ -577,27 +560,21 @@ class UnlabelledCandidate(CorrectingCandidate):
 
 
 def default_candidates(
-    rope: RoPE | None = None,
-    x_o: Tensor | None = None,
-    *,
-    learn_prior: bool = True,
+    rope: RoPE | None = None, x_o: Tensor | None = None, *, learn_prior: bool = True
 ) -> tuple[Candidate, ...]:
     """Return the prior, NPE, fine-tuned NPE, discrepancy models, and regressions.
-
-    NPE is fine-tuned on the pairs alone, and from discrepancy models, and on pairs and
-    simulations together. Regressions do without the simulator.
 
     Args:
         rope: A RoPE with its calibration pairs. Candidates that these data do not
             allow or need are left out, as in :func:`stack`. None returns all.
         x_o: Real observations without labels, shape ``(n_o, *event)``, other than those
-            of the pairs. They add a discrepancy that is learned from them, too. With a
-            rope, it is left out if there are fewer than 30, x is no vector of at most
-            ten entries, or labels are not exact.
+            of the pairs. They add a discrepancy that is learned from them, too, unless
+            they are fewer than 30 or no vectors of at most ten entries, or labels are
+            not exact.
         learn_prior: Whether candidates may learn from the pairs how parameters are
             distributed. They should if the pairs are drawn like the observations to be
-            inferred. With False, discrepancy models keep the prior of NPE.
-            Fine-tuned candidates cannot keep it, and are left out.
+            inferred. With False, discrepancy models keep the prior of NPE, and others
+            that are trained on pairs are left out.
 
     Raises:
         InvalidInputError: If an argument has the wrong type, or, with a rope, x_o has

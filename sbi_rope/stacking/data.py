@@ -51,13 +51,10 @@ class StackData:
     that say what it depends on.
 
     Args:
-        rope: RoPE with all calibration pairs.
+        rope: RoPE with all calibration pairs, of at least two groups.
         num_folds: Number of folds. There are at most as many as groups of pairs.
         seed: Seed of everything random.
         show_progress_bars: Whether to show the progress of trainings and simulations.
-
-    Raises:
-        NotReadyError: If there are fewer than two groups of pairs.
     """
 
     def __init__(
