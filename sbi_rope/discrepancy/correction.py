@@ -53,8 +53,8 @@ NUM_DRAWS, MAX_ENTRIES, BLOCK = 2000, 2**24, 40
 MOST_ENTRIES = 500
 # More standard deviations than this refute that the simulator is right.
 LARGEST_SURPRISE = 5.0
-# Simulations in a step, and steps in a course. The density behind a net adapts
-# within a hundred steps; a whole network takes longer.
+# Simulations in a step, and steps in a course. A whole network adapts slower than a
+# density behind a net.
 BEHIND_NET = Training(training_batch_size=80, learning_rate=1e-2, max_num_epochs=250)
 TRAINING = {
     "embedding": BEHIND_NET,
@@ -63,11 +63,9 @@ TRAINING = {
 }
 # Corrected simulations on which the loss before and after a course is compared.
 NUM_COMPARED = 1920
-# Courses follow each other until one gains less than 0.01 nats. In a stack, where many
-# versions are trained, a single course is enough for most, but not for images: only if
-# the loss still falls by so many nats in its last quarter, a longer one follows.
-# Without an embedding net it adds nothing. Chosen on calibration data, see
-# benchmarks/choices.md.
+# Courses follow each other until one gains less than 0.01 nats. In a stack a single one
+# is enough for most: a longer one follows only if the loss still falls by so many nats
+# in its last quarter. Chosen on calibration data, see benchmarks/choices.md.
 COURSES = Courses(min_gain=0.01)
 IN_A_STACK = Courses(min_gain=0.01, min_fall=0.3, max_num=2)
 
@@ -109,19 +107,15 @@ def fit_discrepancy(
     weights: Tensor | None = None,
     groups: Tensor | None = None,
 ) -> Discrepancy:
-    """Fit the model to pairs, represented by z ``(n, l)``, in units of simulations.
-
-    That the simulator is right counts as impossible if the pairs refute it by
-    themselves, see :func:`surprise`. The evidence alone would not: with few pairs and
-    many entries, a right simulator that fits badly can have more of it than all
-    discrepancies, each of which has many coefficients to learn.
-    """
+    """Fit the model to pairs, represented by z ``(n, l)``, in units of simulations."""
     if not standardisation.varies.any():
         raise InvalidInputError(
             "Expected simulations that differ from each other; got the same embedding "
             "(or the same x) for all of them."
         )
     z, unit = standardisation(z.double()), in_units(moments, standardisation)
+    # With few pairs and many entries, a right simulator that fits badly can have more
+    # evidence than all discrepancies, each of which has many coefficients to learn.
     found = surprise(z, unit.means, unit.covariance, weights, groups)
     if found > LARGEST_SURPRISE and model.probability_of_none < 1.0:
         model = replace(model, probability_of_none=0.0)
@@ -169,10 +163,9 @@ def tuning_targets(
 ) -> Tensor:
     r"""Return the targets ``(n, l)`` of the tuning, :math:`E[h(S(\theta)) \mid y, x]`.
 
-    A label y that leaves parameters open leaves open the target, too. A net that is
-    tuned to its average under the prior would forget what x says about these
-    parameters. The average is therefore also given x, under the discrepancy model that
-    is fitted to these pairs.
+    A net that is tuned to averages given a partial label y alone would forget what x
+    says about the other parameters. They are therefore also given x, under the
+    discrepancy model that is fitted to these pairs.
     """
     model = DiscrepancyModel()
     found = fit_discrepancy(z, moments, standardisation, model, weights, groups)
@@ -304,10 +297,7 @@ def correct_flow(
 
 
 class SimulatedConstants(nn.Module):
-    """Sets entries that are the same in all simulations to their simulated value.
-
-    The density has never seen them vary, so that other values would be arbitrary.
-    """
+    """Sets entries that never vary in simulations to their simulated value."""
 
     varies: Tensor
     values: Tensor

@@ -26,16 +26,14 @@ from sbi_rope.tensors import as_batch
 
 __all__ = ["DiscrepancyModel", "expected_means"]
 
-# How many times as large the variance between the groups is as the one within them, and
-# their prior probabilities. Those below .2 matter for large groups only. Together they
-# are as probable as one of the others.
+# Ratios of the variance between groups to the one within them, and their prior. Those
+# below .2 matter for large groups only; together they are as probable as another one.
 VARIANCE_RATIOS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 PRIOR_OF_RATIOS = (1 / 30,) * 5 + (1 / 6,) * 5
 # Chains that are run side by side, which costs hardly more than one of them.
 NUM_CHAINS = 10
-# Imputations of a chain that are left out, because they depend on where it started, and
-# those that the posterior is averaged over, so many later ones apart. If labels are as
-# noisy as the prior is wide, imputations that far apart are nearly independent.
+# The first imputations of a chain, which depend on its start, and those that are kept, so
+# far apart that they are nearly independent for labels as noisy as the prior is wide.
 NUM_WARM_UP, NUM_KEPT, APART = 100, 2, 30
 # Numbers in the largest tensor, unless one chain needs more.
 MAX_ENTRIES = 2**22
@@ -183,10 +181,7 @@ class DiscrepancyModel(Settings):
     def _conditional(
         self, mean: Tensor, weights: Tensor, *, z: Tensor, noise: Tensor, once: Tensor
     ) -> Conditional:
-        """Return the posteriors given B sets of means, shape ``(B, n, l)``.
-
-        ``once`` are the weights if each group counts as one pair, shape ``(n,)``.
-        """
+        """Return the posteriors given B sets of means, shape ``(B, n, l)``."""
         settings, precisions = self._settings, self.gain_precisions
         regressions = Regressions.of(z, mean, precisions, weights, noise)
         log_evidence = judged = regressions.log_evidence(settings)
@@ -236,14 +231,10 @@ def impute(
 ) -> Discrepancy:
     r"""Average the posterior over imputed means, by Gibbs sampling in C chains.
 
-    Given a gain, an offset and an error, the possible means :math:`m_{ir}` of an
-    observation, ``(n, R, l)``, have the probabilities
-
-    .. math:: p_{ir} \propto \mathcal N(z_i; A m_{ir} + b, \Sigma).
-
-    We draw one of them for each observation, and then the next gain, offset and error
-    from their posterior given these means, ``(C, n, l)``, and given how many pairs each
-    counts as, ``(n,)`` or ``(C, n)``.
+    We draw one of the possible means :math:`m_{ir}` of each observation, ``(n, R, l)``,
+    with probabilities :math:`p_{ir} \propto \mathcal N(z_i; A m_{ir} + b, \Sigma)`, and
+    then A, b and :math:`\Sigma` from their posterior given these means, ``(C, n, l)``,
+    and given how many pairs each counts as, ``(n,)`` or ``(C, n)``.
     """
     mean = possible.mean(dim=1).expand(NUM_CHAINS, -1, -1)
     weights = counts(mean)
@@ -273,11 +264,7 @@ def impute(
 
 
 def expected_means(discrepancy: Discrepancy, z: Tensor, possible: Tensor) -> Tensor:
-    r"""Return the means ``(n, l)`` of observations that are expected given them.
-
-    This is :math:`\sum_r p_{ir}\, m_{ir}` with the probabilities of :func:`impute`,
-    averaged over the posterior of the discrepancy.
-    """
+    r"""Return :math:`\sum_r p_{ir}\, m_{ir}`, ``(n, l)``, averaged over discrepancies."""
     noise = discrepancy.noise
     right = torch.eye(len(noise)).to(noise), noise.new_zeros(len(noise)), noise
     drawn = []

@@ -23,16 +23,13 @@ __all__ = [
 # Draws of the prior that the parameters of pairs are compared with, and draws of each
 # label that is not exact.
 NUM_FROM_PRIOR, NUM_SETS = 10_000, 10
-# The prior's mean and covariance count as much as this number of pairs. The results are
-# averaged, weighted by their evidence.
+# The prior's mean and covariance count as much as one of these numbers of pairs.
 STRENGTHS = (2.0, 5.0, 10.0, 30.0, 100.0)
-# Parameters of pairs are said not to follow the prior if this is less probable. At most
-# one in 19 sets of pairs from the prior gets there by chance, because the two were
-# equally probable before (Markov's inequality).
+# Parameters of pairs are said not to follow the prior if this is less probable. By
+# Markov's inequality, at most one in 19 sets of pairs from the prior gets there.
 IMPROBABLE = 0.05
 # Scores of labels are cut off where one of so many sets of pairs from the prior has a
-# score at one end. The score of a label on a bound would have no end with ever more
-# simulations, although rounding alone puts labels there.
+# score at one end. Rounding puts labels on a bound, whose scores have no end.
 SETS_CUT_OFF = 20
 # Normal scores of a parameter with a more frequent value are not normal.
 MAX_SHARE = 0.05

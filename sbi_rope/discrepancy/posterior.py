@@ -23,19 +23,16 @@ __all__ = [
 MAX_ENTRIES = 2**22
 # The smallest noise of an entry, relative to the largest, that is told apart from none.
 SMALLEST_SCALE = 0.01
-# Two smallest standard deviations, in standard deviations of simulations from the
-# prior and times D. The noise at one parameter gets the first, because some statistics
-# have none. The second is that of the error, which is smaller for x: it can be known
-# more precisely than an embedding.
+# The smallest standard deviations of noise and error, in those of simulations from the
+# prior, times D. Some statistics have no noise. x can be known more precisely than h(x).
 SMALLEST_NOISE = 0.01
 SMALLEST_ERROR = {"embedding": 0.01, "tuned": 0.01, "input": 0.003}
 
 
 def noise_scale(covariance: Tensor) -> Tensor:
-    """Return the diagonal of D: the noise of each entry, relative to the largest.
+    """Return the diagonal of D, the noise of each entry relative to the largest.
 
-    The covariance is that of simulations at one parameter, ``(*batch, l, l)``. D is
-    one if there is no noise at all.
+    The covariance is that of simulations at one parameter, ``(*batch, l, l)``.
     """
     std = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
     largest = std.amax(dim=-1, keepdim=True)
@@ -106,16 +103,14 @@ class Discrepancy:
     ) -> "DiscrepancyDraws":
         r"""Draw gains, offsets and errors.
 
-        A share ``probability_of_none`` of the draws has gain one, offset zero and no
-        error. In the other draws the error is :math:`\Sigma` without the simulator's
-        own noise, :math:`\Sigma' = \Sigma - A C A^\top`. The eigenvalues of
-        :math:`D^{-1} \Sigma' D^{-1}` are at least ``smallest_error`` squared, with the
-        noise D of :class:`DiscrepancyModel`.
+        A share ``probability_of_none`` of the draws corrects nothing. In the others the
+        error is without the simulator's own noise,
+        :math:`\Sigma' = \Sigma - A C A^\top`.
 
         Args:
             num_draws: Number of draws.
-            smallest_error: Smallest standard deviation of the error of the entry with
-                most noise, in standard deviations of simulations.
+            smallest_error: The eigenvalues of :math:`D^{-1} \Sigma' D^{-1}` are at least
+                this squared, with the noise D of :class:`DiscrepancyModel`.
             seed: Seed of the draws; None uses torch's state.
         """
         none = self.probability_of_none

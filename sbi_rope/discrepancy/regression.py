@@ -16,25 +16,18 @@ __all__ = ["Conditional", "GroupErrors", "Regressions", "independent_pairs"]
 # The prior precision of the offset is this share of the precision of the gain.
 OFFSET_PRECISION = 1 / 3
 # The prior precision of the gain is at least this times the noise C of each entry and
-# the number of entries. What is uncertain about the gain then adds a quarter of the
-# error to the noise, at most and on average. Without this, the noise of imprecise
-# entries leaks into a precise one, along directions in which the means of the pairs do
-# not vary.
+# the number of entries. Otherwise, the noise of imprecise entries leaks into a precise
+# one, along directions in which the means of the pairs do not vary.
 LEAST_PRECISION = 4.0
-# Settings of the hyper-parameters are left out if their evidence is less than this
-# share of the evidence of the best setting.
+# Settings with less than this share of the evidence of the best one are left out.
 NEGLIGIBLE = 1e-4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class GroupErrors:
-    r"""Errors :math:`E \sim \mathcal{MN}(0, R, \Sigma)` of pairs in groups.
+    r"""Errors :math:`E \sim \mathcal{MN}(0, R, \Sigma)`, correlated within groups."""
 
-    R is 1 on the diagonal, the correlation within a group, and 0 between groups. These
-    are numbered from 0 on, shape ``(n,)``.
-    """
-
-    groups: Tensor
+    groups: Tensor  # the number of the group of each pair, from 0 on, (n,)
     correlation: float
 
     def independent(self, values: Tensor) -> Tensor:
@@ -59,12 +52,9 @@ class GroupErrors:
 def independent_pairs(
     groups: Tensor, correlation: float | Tensor, weights: Tensor
 ) -> Tensor:
-    r"""Return how many independent pairs each counts as (Kish), ``(*batch, n)``.
-
-    A pair among k of its group counts as :math:`1 / (1 + (k - 1) \rho)`, where k is the
-    squared sum of the group's weights over the sum of their squares.
-    """
+    """Return how many independent pairs each counts as (Kish), ``(*batch, n)``."""
     w = weights.double()
+    # The effective number of pairs of each group, if their weights differ.
     number = groups.bincount(weights=w).square() / groups.bincount(weights=w.square())
     correlation = torch.as_tensor(correlation).to(w)[..., None]
     return w / (1 + (number[groups] - 1) * correlation)
@@ -102,9 +92,8 @@ class Regressions:
     ) -> "Regressions":
         """Return the conjugate posterior of the coefficients at each form.
 
-        Observations z have the shape ``(n, l)``, means ``(B, n, l)``, and weights
-        ``(n,)`` or ``(B, n)``. They are one if ``errors`` are correlated. ``noise`` is
-        C, the covariance of simulations at one parameter.
+        Means have the shape ``(B, n, l)``, and weights ``(n,)`` or ``(B, n)``. The
+        weights are one if ``errors`` are correlated.
         """
         width = mean.shape[2]
         identity = torch.eye(width).to(z)
@@ -155,10 +144,7 @@ class Regressions:
         )
 
     def log_evidence(self, settings: Sequence[tuple[float, float]]) -> Tensor:
-        """Return the log density of the pairs at each form and setting, ``(B, K, S)``.
-
-        The settings are S pairs of an error scale and its strength.
-        """
+        """Return the log density of the pairs at each form and setting, ``(B, K, S)``."""
         n, width = self.num_pairs[:, None, None], self.variances.shape[-1]
         error_scale, strength = self.variances.new_tensor(settings).unbind(dim=1)
         scale = strength * error_scale.square()
@@ -174,10 +160,7 @@ class Regressions:
         )
 
     def at(self, where: tuple[Any, Any], setting: Any) -> Term:
-        """Return the posterior at a set and form, and at a setting.
-
-        All are numbers, or tensors of shape ``(m,)`` for m terms in one.
-        """
+        """Return the posterior at one set, form and setting, or at m, ``(m,)``, of each."""
         error_scale, strength = (torch.as_tensor(s).to(self.variances) for s in setting)
         scale = self.variances[where] + (strength * error_scale.square())[..., None]
         error_factor = self.directions[where] * scale[..., None, :].sqrt()
@@ -225,11 +208,7 @@ class Conditional:
         )
 
     def draw(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Draw a gain, an offset and the covariance of observations at one parameter.
-
-        There is one of each for each set of means, and no setting is left out. The
-        shapes are ``(B, l, l)``, ``(B, l)`` and ``(B, l, l)``.
-        """
+        """Draw a gain, an offset and the covariance of z given theta for each set."""
         probabilities = torch.softmax(self.log_evidence.flatten(1), dim=1)
         chosen = torch.multinomial(probabilities, 1)[:, 0]
         k, s = chosen // len(self.settings), chosen % len(self.settings)

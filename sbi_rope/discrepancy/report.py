@@ -103,8 +103,7 @@ class DiscrepancyReport:
             Summaries without a sign of discrepancy are last.
         num_pairs: The number of calibration pairs.
         num_groups: The number of people or specimens that they are of.
-        constant: The names of summaries that are the same in all simulations. Nothing
-            can be said about them.
+        constant: The names of summaries that are the same in all simulations.
     """
 
     summaries: tuple[SummaryDiscrepancy, ...]
@@ -213,12 +212,10 @@ def report_discrepancy(
     groups: Tensor | None = None,
     show_progress_bars: bool = False,
 ) -> DiscrepancyReport:
-    """Fit the discrepancy of each summary separately.
+    """Fit the discrepancy of each summary of x ``(n, l)`` separately.
 
     A joint gain of summaries that depend on each other, such as two sensors of one
     light, is ambiguous. The gain of a single summary is not, and can be checked.
-    Observations x have the shape ``(n, l)``, and simulations from the prior
-    ``(n_s, l)``.
     """
     unit = Standardisation(simulated.double())
     is_constant = (~unit.varies).tolist()

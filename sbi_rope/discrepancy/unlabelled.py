@@ -23,8 +23,7 @@ __all__ = ["LaplaceDiscrepancy", "Marginal", "fit_unlabelled"]
 # Gaussians that the marginal density of simulations mixes, fitted to so many.
 NUM_COMPONENTS, NUM_FITTED = 25, 8000
 # Prior standard deviations of the offset, and of the diagonal and the other entries of
-# the gain. Centre of the standard deviations of the error, whose logarithms have the
-# standard deviation one.
+# the gain. Centre of those of the error, whose logarithms have standard deviation one.
 OFFSET, DIAGONAL, OFF_DIAGONAL, ERROR = 0.3, 0.3, 0.1, 0.3
 # The search for the mode, and how far below it the result may be, in nats.
 SEARCH = Training(learning_rate=3e-2, max_num_epochs=200)
@@ -94,10 +93,7 @@ def fit_unlabelled(
     This is right only where the parameters of the observations follow the prior. The
     mode is searched from that of the labels alone, and its Hessian gives the covariance
     (Laplace's approximation). All quantities are in standard deviations of simulations.
-
-    Real observations z with exact labels have the shape ``(n, l)``, and z_o without
-    labels ``(n_o, l)``. Each of E versions has weights, ``(E, n)``, and does not see
-    those of weight zero.
+    Each of E versions has weights, ``(E, n)``, and does not see those of weight zero.
     """
     z_o, width, count = z_o.double(), z.shape[1], len(weights)
     seen = (weights > 0)[..., None]
@@ -207,9 +203,8 @@ def _unpacked(values: Tensor, width: int) -> tuple[Tensor, Tensor, Tensor]:
     entries = torch.where(
         rows == columns, ERROR * triangle.clamp(-8, 8).exp(), 0.3 * ERROR * triangle
     )
-    place = torch.zeros(len(rows), width, width).to(values)
-    place[torch.arange(len(rows)), rows, columns] = 1.0
-    factor = torch.einsum("...k,kij->...ij", entries, place)
+    factor = torch.zeros_like(gain)
+    factor[..., rows, columns] = entries
     return gain, OFFSET * offset, factor
 
 

@@ -343,12 +343,15 @@ def started(
         flow = Flow.of([data.estimator])
         return flow.made_of([(0, 0)] * len(of_version)), numbers
     found = corrected(data, versions, space, learn_prior=learn_prior)
-    if space != "tuned":
-        return found.flow[of_version], numbers
-    nets = tuned(data, versions)
-    of_nets = [number for rows in versions for number in nets.of(rows, data)]
+    if space == "embedding":
+        return found.flow.behind_one_net(of_version), numbers
+    of_nets, nets = [min(v, len(found.flow.nets) - 1) for v in of_version], None
+    if space == "tuned":
+        of_parts = tuned(data, versions)
+        of_nets = [number for rows in versions for number in of_parts.of(rows, data)]
+        nets = of_parts.nets.then(found.constants)
     members = list(zip(of_nets, of_version, strict=True))
-    return found.flow.made_of(members, nets.nets.then(found.constants)), numbers
+    return found.flow.made_of(members, nets), numbers
 
 
 def _numbers(of_version: Sequence[int], count: int) -> list[list[int]]:

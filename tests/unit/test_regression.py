@@ -1,9 +1,7 @@
 """A Gaussian process of the parameters, against scikit-learn and refits."""
 
-import math
 from unittest.mock import patch
 
-import numpy as np
 import pytest
 import torch
 from scipy import stats
@@ -122,6 +120,4 @@ def test_labels_that_hold_one_parameter_fixed_are_refused() -> None:
     posterior = method.train().build_posterior()
     samples = posterior.sample_batched((50,), x, show_progress_bars=False)
     assert problems.box(2).support.check(samples).all()
-    assert math.isfinite(
-        float(np.mean(posterior.log_prob_batched(theta[None], x).numpy()))
-    )
+    assert posterior.log_prob_batched(theta[None], x).isfinite().all()
