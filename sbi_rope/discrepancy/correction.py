@@ -128,8 +128,8 @@ def fit_version(
     z: Tensor,
     moments: Moments,
     simulations: tuple[Tensor, Tensor],
-    *,
     model: DiscrepancyModel,
+    *,
     learn_prior: bool,
 ) -> tuple[Discrepancy, Tensor | None]:
     """Return what pairs say of the discrepancy, and of the parameters if learned."""

@@ -32,8 +32,8 @@ VARIANCE_RATIOS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 PRIOR_OF_RATIOS = (1 / 30,) * 5 + (1 / 6,) * 5
 # Chains that are run side by side, which costs hardly more than one of them.
 NUM_CHAINS = 10
-# The first imputations of a chain, which depend on its start, and those that are kept, so
-# far apart that they are nearly independent for labels as noisy as the prior is wide.
+# The first imputations of a chain depend on its start. Those that are kept are so far
+# apart that they are nearly independent for labels as noisy as the prior is wide.
 NUM_WARM_UP, NUM_KEPT, APART = 100, 2, 30
 # Numbers in the largest tensor, unless one chain needs more.
 MAX_ENTRIES = 2**22
@@ -264,7 +264,7 @@ def impute(
 
 
 def expected_means(discrepancy: Discrepancy, z: Tensor, possible: Tensor) -> Tensor:
-    r"""Return :math:`\sum_r p_{ir}\, m_{ir}`, ``(n, l)``, averaged over discrepancies."""
+    r"""Return the posterior mean of :math:`\sum_r p_{ir}\, m_{ir}`, ``(n, l)``."""
     noise = discrepancy.noise
     right = torch.eye(len(noise)).to(noise), noise.new_zeros(len(noise)), noise
     drawn = []

@@ -78,14 +78,12 @@ class DiscrepancyNPE(Method):
             appended simulations are used instead.
         space: What is corrected, see above.
         learn_prior: Whether to learn the distribution of real parameters from those of
-            the pairs, see :func:`~sbi_rope.discrepancy.learn_parameters`. The pairs
-            must then be drawn like the observations to be inferred. Otherwise, pass
-            False.
+            the pairs, see :func:`~sbi_rope.discrepancy.learn_parameters`. Pass False
+            unless the pairs are drawn like the observations to be inferred.
         model: The model of the discrepancy; ``DiscrepancyModel()`` if None.
         num_simulations: Simulations from the prior to train on, if none were appended.
-        num_steps: Gradient steps. If None, NPE is trained in courses of 200 steps (400
-            with ``"input"``), until a course lowers the loss by less than 0.01, at most
-            twelve.
+        num_steps: Gradient steps. If None, NPE is trained in at most twelve courses of
+            250 steps (400 with ``"input"``), until one gains less than 0.01 nats.
         npe_training: How NPE is trained; ``Training()`` if None.
         device: Where to train; data on other devices is moved there.
     """
@@ -146,17 +144,14 @@ class DiscrepancyNPE(Method):
 
         Args:
             summaries: A function from observations ``(n, *event)`` to a few summaries
-                of each, ``(n, k)``, such as the means of parts of an image, or mean and
-                spread of a set of trials. It may return a NumPy array. If None, the
-                summaries are the entries of x, which has to be a vector.
+                of each, ``(n, k)``, such as the means of parts of an image. It may
+                return a NumPy array. If None, they are the entries of a vector x.
             x_names: Names of the summaries; numbered if None.
             seed: Seed of the simulations, as in ``train``.
-            show_progress_bars: Whether to show the progress of slow simulations, and of
-                many summaries, as in ``train``.
+            show_progress_bars: As in ``train``.
 
         Returns:
-            The gain, shift and error of each summary with 95 % intervals, in the units
-            of x or of the summaries.
+            The gain, shift and error of each summary with 95 % intervals.
         """
         self._check_data("calibration")
         if self._simulator is None:
@@ -222,14 +217,8 @@ class DiscrepancyNPE(Method):
                 net, found.mean.to(z), x_s, show_progress_bars=show
             )
         simulations = theta_s, embed(net, x_s)
-        version = fit_version(
-            pairs,
-            z,
-            found,
-            simulations,
-            model=self.model,
-            learn_prior=self.learn_prior,
-        )
+        given, learn_prior = (pairs, z, found, simulations), self.learn_prior
+        version = fit_version(*given, self.model, learn_prior=learn_prior)
         self._discrepancy, _ = version
         correction = correct_flow(
             estimator,
@@ -250,10 +239,7 @@ class DiscrepancyNPE(Method):
     def _cross_fitted(
         self, h: nn.Module, targets: Tensor, x_s: Tensor, *, show_progress_bars: bool
     ) -> tuple[Ensemble, Tensor]:
-        """Tune a copy of h without each fold of the pairs, and embed the fold with it.
-
-        The pairs that a net was tuned on are embedded too close to their simulations.
-        """
+        """Tune a copy of h without each fold, and embed the fold with it."""
         pairs = self._data.pairs
         if pairs.num_groups == 1:
             raise InvalidInputError(

@@ -1,8 +1,8 @@
 r"""The distribution of parameters, learned from those of the calibration pairs."""
 
 import math
-from dataclasses import dataclass
 from statistics import fmean
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -35,15 +35,11 @@ SETS_CUT_OFF = 20
 MAX_SHARE = 0.05
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ParameterDistribution:
-    """Probabilities that make simulations from the prior follow the real parameters.
+class ParameterDistribution(NamedTuple):
+    """The probability of each simulation, ``(n,)``, and that of the prior.
 
-    Attributes:
-        probabilities: The probability of each simulation, shape ``(n,)``; they sum to
-            one.
-        probability_of_prior: The probability that real parameters follow the prior;
-            0.5 if all are discrete.
+    With these, simulations from the prior follow the real parameters. If all parameters
+    are discrete, the probability that the real ones follow the prior is 0.5.
     """
 
     probabilities: Tensor
@@ -96,14 +92,12 @@ def learn_parameters(
     is_continuous = most <= max(1.0, MAX_SHARE * len(theta))
     uniform = theta.new_full((len(theta),), 1.0 / len(theta), dtype=torch.double)
     if not is_continuous.any():
-        return ParameterDistribution(probabilities=uniform, probability_of_prior=0.5)
+        return ParameterDistribution(uniform, 0.5)
     sets = theta_cal.unbind(dim=1)[:NUM_SETS] if theta_cal.ndim == 3 else [theta_cal]
     parts = [_learn(draws, theta, weights, is_continuous) for draws in sets]
     mixed = [p * uniform + (1.0 - p) * ratio for p, ratio in parts]
-    return ParameterDistribution(
-        probabilities=torch.stack(mixed).mean(dim=0),
-        probability_of_prior=fmean(p for p, _ in parts),
-    )
+    of_prior = fmean(p for p, _ in parts)
+    return ParameterDistribution(torch.stack(mixed).mean(dim=0), of_prior)
 
 
 def probability_of_prior(pairs: Pairs, prior: Distribution, *, seed: int = 0) -> float:

@@ -24,7 +24,7 @@ MAX_ENTRIES = 2**22
 # The smallest noise of an entry, relative to the largest, that is told apart from none.
 SMALLEST_SCALE = 0.01
 # The smallest standard deviations of noise and error, in those of simulations from the
-# prior, times D. Some statistics have no noise. x can be known more precisely than h(x).
+# prior, times D. Some statistics have no noise. x can be more precise than h(x).
 SMALLEST_NOISE = 0.01
 SMALLEST_ERROR = {"embedding": 0.01, "tuned": 0.01, "input": 0.003}
 
@@ -109,8 +109,8 @@ class Discrepancy:
 
         Args:
             num_draws: Number of draws.
-            smallest_error: The eigenvalues of :math:`D^{-1} \Sigma' D^{-1}` are at least
-                this squared, with the noise D of :class:`DiscrepancyModel`.
+            smallest_error: The least root of the eigenvalues of
+                :math:`D^{-1} \Sigma' D^{-1}`, see :class:`DiscrepancyModel`.
             seed: Seed of the draws; None uses torch's state.
         """
         none = self.probability_of_none
@@ -168,10 +168,7 @@ class DiscrepancyDraws:
         return len(self.offset)
 
     def correct(self, z_s: Tensor, draw: Tensor | None = None) -> Tensor:
-        """Return simulations as they would be observed in reality.
-
-        Each is corrected by a random draw and gets an error of its own. Together they
-        represent the whole posterior.
+        """Return simulations as they would be observed in reality, with own errors.
 
         Args:
             z_s: Simulations, shape ``(n, l)``.

@@ -144,7 +144,7 @@ class Regressions:
         )
 
     def log_evidence(self, settings: Sequence[tuple[float, float]]) -> Tensor:
-        """Return the log density of the pairs at each form and setting, ``(B, K, S)``."""
+        """Return the log density of the pairs at forms and settings, ``(B, K, S)``."""
         n, width = self.num_pairs[:, None, None], self.variances.shape[-1]
         error_scale, strength = self.variances.new_tensor(settings).unbind(dim=1)
         scale = strength * error_scale.square()
@@ -160,7 +160,7 @@ class Regressions:
         )
 
     def at(self, where: tuple[Any, Any], setting: Any) -> Term:
-        """Return the posterior at one set, form and setting, or at m, ``(m,)``, of each."""
+        """Return the posterior at one set, form and setting, or at m, ``(m,)``."""
         error_scale, strength = (torch.as_tensor(s).to(self.variances) for s in setting)
         scale = self.variances[where] + (strength * error_scale.square())[..., None]
         error_factor = self.directions[where] * scale[..., None, :].sqrt()

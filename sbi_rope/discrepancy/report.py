@@ -65,15 +65,13 @@ class SummaryDiscrepancy:
         shift: b, in the units of x.
         error: s, in the units of x. It comes in addition to the simulator's noise.
         size: Typical difference between a simulation and its correction, the root of
-            :math:`E[(b + (a - 1)(x_s - \bar x))^2] + s^2`, in standard deviations of
-            simulations from the prior.
+            :math:`E[(b + (a - 1)(x_s - \bar x))^2] + s^2`, in units of ``std``.
         probability_of_none: The probability that the simulator is right about this
             summary, with one half before any pair is seen.
         outliers: Rows of calibration pairs that do not fit the others. In 99 of 100
             summaries without outliers no pair is so far away by chance.
         std: The standard deviation of simulations from the prior, in the units of x.
-        num_independent: How many independent pairs the calibration pairs count as here,
-            see :class:`~sbi_rope.discrepancy.DiscrepancyModel`.
+        num_independent: How many independent pairs the calibration pairs count as here.
     """
 
     name: str

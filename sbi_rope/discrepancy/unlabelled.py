@@ -120,7 +120,8 @@ def fit_unlabelled(
             log_p = log_p + of_each.logsumexp(dim=1).sum(dim=1)
         return at.square().sum(dim=1) / 2 - log_p
 
-    modes = _Modes(torch.zeros(count, _num_entries(width)).to(z))
+    num_entries = width**2 + width + width * (width + 1) // 2
+    modes = _Modes(torch.zeros(count, num_entries).to(z))
     for unlabelled in (False, True):
         fit(
             modes,
@@ -187,15 +188,10 @@ def _polished(
     return at, root, white.square().sum(dim=(1, 2)) / 2
 
 
-def _num_entries(width: int) -> int:
-    return width**2 + width + width * (width + 1) // 2
-
-
 def _unpacked(values: Tensor, width: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return gain, offset and a factor of the error, of numbers ``(*batch, P)``."""
-    gain, offset, triangle = values.split(
-        [width**2, width, _num_entries(width) - width**2 - width], dim=-1
-    )
+    sizes = width**2, width, width * (width + 1) // 2
+    gain, offset, triangle = values.split(sizes, dim=-1)
     one = torch.eye(width).to(values)
     std = OFF_DIAGONAL + (DIAGONAL - OFF_DIAGONAL) * one
     gain = one + std * gain.unflatten(-1, (width, width))

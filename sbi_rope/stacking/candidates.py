@@ -190,10 +190,8 @@ class CorrectingCandidate(Candidate):
     space: Space | None
 
     def suits(self, data: StackData) -> bool:
-        """Tell whether x is a short vector, or else there are folds enough to tune.
-
-        A short vector is corrected as it is, so that tuned nets add nothing.
-        """
+        """Tell whether x is a short vector, or else there are folds enough to tune."""
+        # A short vector is corrected as it is, so that tuned nets add nothing.
         if self.space == "tuned":
             return not data.reads_summaries and len(data.folds) > 2
         return self.space != "input" or data.reads_summaries
@@ -256,29 +254,20 @@ def corrected(
                 of_rows,
                 data.moments(rows, space),
                 simulations,
-                model=data.model,
+                data.model,
                 learn_prior=learn_prior,
             )
             for of_rows, rows in zip(z, versions, strict=True)
         ]
-        data.kept[key] = _trained(data, simulations, fitted, space)
+        data.kept[key] = correct_flow(
+            data.estimator,
+            simulations,
+            fitted,
+            space=space,
+            in_a_stack=True,
+            show_progress_bars=data.show,
+        )
     return data.kept[key]
-
-
-def _trained(
-    data: StackData,
-    simulations: tuple[Tensor, Tensor],
-    versions: Sequence[Version],
-    space: Space,
-) -> Correction:
-    return correct_flow(
-        data.estimator,
-        simulations,
-        versions,
-        space=space,
-        in_a_stack=True,
-        show_progress_bars=data.show,
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -336,9 +325,12 @@ def started(
     learn_prior: bool = True,
 ) -> tuple[Flow, list[list[int]]]:
     """Return NPE, corrected or not, for each part of each version; their numbers."""
-    parts = [_seen(rows, data) for rows in versions]
-    of_version = [version for version, some in enumerate(parts) for _ in some]
-    numbers = _numbers(of_version, len(versions))
+    numbers: list[list[int]] = []
+    of_version: list[int] = []
+    for version, rows in enumerate(versions):
+        first, count = len(of_version), len(_seen(rows, data))
+        numbers.append([*range(first, first + count)])
+        of_version += [version] * count
     if space is None:
         flow = Flow.of([data.estimator])
         return flow.made_of([(0, 0)] * len(of_version)), numbers
@@ -352,14 +344,6 @@ def started(
         nets = of_parts.nets.then(found.constants)
     members = list(zip(of_nets, of_version, strict=True))
     return found.flow.made_of(members, nets), numbers
-
-
-def _numbers(of_version: Sequence[int], count: int) -> list[list[int]]:
-    """Return the numbers of the members of each version."""
-    of_each = [[] for _ in range(count)]
-    for number, version in enumerate(of_version):
-        of_each[version].append(number)
-    return of_each
 
 
 # How NPE is fine-tuned. Behind a corrected x all parameters were trained already, and a
@@ -378,11 +362,10 @@ class FinetunedCandidate(CorrectingCandidate):
     density is trained.
 
     Args:
-        space: None starts from the unchanged NPE. Otherwise, what is corrected in the
-            NPE that it starts from.
-        rehearse: Whether to train on simulations, too, so as to minimise what
-            :class:`~sbi_rope.baselines.JointNPE` minimises from scratch. It is for
-            images, series and sets of trials, where the embedding net has to learn what
+        space: What is corrected in the NPE that it starts from; nothing if None.
+        rehearse: Whether to train on simulations, too, as
+            :class:`~sbi_rope.baselines.JointNPE` does from scratch. It is for images,
+            series and sets of trials, where the embedding net has to learn what
             simulations do not show. A version then holds out a single part.
     """
 
@@ -399,15 +382,12 @@ class FinetunedCandidate(CorrectingCandidate):
         self.name += ", rehearsed" if rehearse else ""
 
     def suits(self, data: StackData) -> bool:
-        """Tell whether there are parts to hold out, and the starting NPE applies.
-
-        The embedding is corrected first where x itself is not.
-        """
+        """Tell whether there are parts to hold out, and the starting NPE applies."""
         if len(data.folds) < 3:
             return False
         if self.rehearse:
             return data.pairs.num_groups >= MIN_TO_REHEARSE and not data.is_short
-        if self.space == "embedding":
+        if self.space == "embedding":  # x itself is corrected otherwise
             return not data.reads_summaries
         return super().suits(data)
 
@@ -415,16 +395,17 @@ class FinetunedCandidate(CorrectingCandidate):
         """Train one net without each part of the pairs of each version."""
         flow, members = started(data, versions, self.space)
         starts: list[Density] = [flow[numbers] for numbers in members]
-        jobs = []
+        jobs, of_version = [], []
         for version, rows in enumerate(versions):
             nodes = data.nodes(rows, starts[version])
             own = list(zip(members[version], data.holdouts(rows), strict=False))
             if self.rehearse and own:
                 own = [own[version % len(own)]]
-            jobs += [(version, *job, nodes) for job in own]
+            of_version.append([*range(len(jobs), len(jobs) + len(own))])
+            jobs += [(*job, nodes) for job in own]
         if not jobs:  # there is nothing to hold out
             return starts
-        of_version, numbers, splits, labels = zip(*jobs, strict=True)
+        numbers, splits, labels = zip(*jobs, strict=True)
         flow = flow[numbers]
         rate = LEARNING_RATE_OF_INPUT if self.space == "input" else LEARNING_RATE
         finetune_flow(
@@ -440,8 +421,8 @@ class FinetunedCandidate(CorrectingCandidate):
             only_densities=self.space == "embedding",
             show_progress_bars=data.show,
         )
-        trained = _numbers(of_version, len(versions))
-        return [flow[t] if t else one for t, one in zip(trained, starts, strict=True)]
+        trained = zip(of_version, starts, strict=True)
+        return [flow[own] if own else start for own, start in trained]
 
 
 # With fewer pairs the candidate is left out.
@@ -558,8 +539,15 @@ class UnlabelledCandidate(CorrectingCandidate):
             Marginal.of(unit(x_s.double())),
             show_progress_bars=data.show,
         )
-        flow = _trained(data, data.simulations, [(one, None) for one in found], "input")
-        return [flow.flow[[version]] for version in range(len(versions))]
+        flow = correct_flow(
+            data.estimator,
+            data.simulations,
+            [(one, None) for one in found],
+            space="input",
+            in_a_stack=True,
+            show_progress_bars=data.show,
+        ).flow
+        return [flow[[version]] for version in range(len(versions))]
 
 
 def default_candidates(

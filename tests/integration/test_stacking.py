@@ -290,13 +290,6 @@ def test_images_are_stacked_without_candidates_that_need_summaries() -> None:
         stacked(rope, candidates=[PRIOR, DiscrepancyCandidate(space="input")])
 
 
-@pytest.mark.slow
-def test_a_stack_can_use_stored_simulations() -> None:
-    theta = problems.box(2).sample((10,))
-    posterior = stacked(rope_of(simulations=(theta, problems.simulate(theta))))
-    assert posterior.report.cross_validation.log_scores.isfinite().all()
-
-
 @pytest.mark.medium
 def test_few_pairs_are_held_out_one_by_one() -> None:
     for num_pairs in (2, 3):

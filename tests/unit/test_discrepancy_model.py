@@ -169,23 +169,6 @@ def test_the_evidence_of_a_simulator_that_is_right_is_a_normal_density(
     assert discrepancy.probability_of_none == pytest.approx(expected, rel=1e-8)
 
 
-def test_the_evidence_of_the_grid_is_the_average_of_its_settings() -> None:
-    z, mean = pairs(5, 2)
-    grid = DiscrepancyModel(
-        gain_precisions=(0.3, 3.0), error_scales=(0.1, 0.4), degrees_of_freedom=(2.0,)
-    )
-    whole = grid.fit(z, mean, no_noise(2))
-    single = [
-        at(k, s, 2.0).fit(z, mean, no_noise(2)).log_evidence
-        for k in (0.3, 3.0)
-        for s in (0.1, 0.4)
-    ]
-    evidence = torch.tensor(single, dtype=torch.double)
-    expected = float(evidence.logsumexp(0)) - math.log(4)
-    assert whole.log_evidence == pytest.approx(expected, abs=1e-9)
-    assert torch.allclose(whole.shares, evidence.softmax(0), atol=1e-9)
-
-
 def test_the_evidence_of_correlated_errors_is_a_matrix_t_density(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
