@@ -4,7 +4,8 @@ import functools
 import logging
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -22,20 +23,8 @@ from sbi_rope.density import Coupled, MixturePosterior
 
 # Names of `posterior_nn` for continuous parameters, and for mixed ones.
 FAMILIES = [
-    "mdn",
-    "made",
-    "maf",
-    "maf_rqs",
-    "nsf",
-    "zuko_nice",
-    "zuko_maf",
-    "zuko_nsf",
-    "zuko_ncsf",
-    "zuko_sospf",
-    "zuko_naf",
-    "zuko_unaf",
-    "zuko_gf",
-    "zuko_bpf",
+    *("mdn", "made", "maf", "maf_rqs", "nsf", "zuko_nice", "zuko_maf", "zuko_nsf"),
+    *("zuko_ncsf", "zuko_sospf", "zuko_naf", "zuko_unaf", "zuko_gf", "zuko_bpf"),
 ]
 MIXED_FAMILIES = ["mnpe", "mnle"]
 
@@ -71,6 +60,15 @@ def simulate_image(theta: Tensor) -> Tensor:
     return (image + 0.1 * torch.randn(len(theta), 8, 8))[:, None]
 
 
+@contextmanager
+def reproducible() -> Iterator[None]:
+    """Give whoever asks first the same network as all others, without warnings."""
+    with torch.random.fork_rng(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch.manual_seed(1)
+        yield
+
+
 @functools.cache
 def npe_posterior(
     family: str = "maf",
@@ -90,10 +88,7 @@ def npe_posterior(
         "linear": lambda: nn.Sequential(nn.Linear(3, 4), nn.Tanh(), nn.Dropout(0.5)),
         "cnn": SmallCNN,
     }[embedding]
-    with torch.random.fork_rng(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        # Whoever asks first gets the same network as all others.
-        torch.manual_seed(1)
+    with reproducible():
         net = make_net()
         prior = mixed_prior(dim) if family in MIXED_FAMILIES else box(dim)
         theta = prior.sample((200,))
@@ -150,9 +145,7 @@ def trials_net_of_sbi() -> nn.Module:
 @functools.cache
 def trials_posterior(make_net: Callable[[], nn.Module] = TrialsNet) -> Any:
     """Train a small NPE on trials some of which are missing; for reading only."""
-    with torch.random.fork_rng(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        torch.manual_seed(1)
+    with reproducible():
         builder = posterior_nn(
             "mdn", embedding_net=make_net(), z_score_x="none", hidden_features=10
         )
@@ -174,9 +167,7 @@ def vector_field_posterior(method: str) -> Any:
         "npse": (NPSE, posterior_score_nn),
     }[method]
     net = nn.Linear(3, 4)
-    with torch.random.fork_rng(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        torch.manual_seed(1)
+    with reproducible():
         prior = box(2)
         theta = prior.sample((200,))
         estimator = builder("mlp", embedding_net=net, hidden_features=16)
@@ -306,12 +297,10 @@ def brute_force_log_prob(posterior: Any, theta: Tensor) -> Tensor:
 
     One component at a time, in float64; no support, no tail.
     """
-    coupled = posterior.posterior_estimator
-    density = coupled.density
+    coupled, flat = posterior.posterior_estimator, theta.flatten(0, -2)
     columns = []
     for embedding in coupled.simulated:
-        flat = theta.reshape(-1, theta.shape[-1])
         condition = embedding[None].expand(len(flat), -1)
-        log_q = density.log_prob(flat[None], condition)[0]
+        log_q = coupled.density.log_prob(flat[None], condition)[0]
         columns.append(log_q.double().reshape(theta.shape[:-1]))
     return torch.logsumexp(torch.stack(columns, -1) + posterior.weights.log(), dim=-1)

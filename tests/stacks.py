@@ -13,6 +13,7 @@ from torch import Tensor
 from sbi_rope import CalibrationFinetuner, RoPE, StackedPosterior
 from sbi_rope.density import Density, Prior
 from sbi_rope.discrepancy import DiscrepancyModel
+from sbi_rope.discrepancy.correction import TRAINING
 from sbi_rope.finetuning import FINETUNING
 from sbi_rope.fit import Training
 from sbi_rope.stacking import (
@@ -37,31 +38,29 @@ def quick() -> Iterator[None]:
     model = DiscrepancyModel(
         gain_precisions=(1.0,), error_scales=(0.1,), degrees_of_freedom=(3.0,)
     )
-    tuning = CalibrationFinetuner(rehearsal=1.0, learning_rate=0.02, max_num_epochs=3)
-    room = "sbi_rope.stacking."
+    correcting = Training(training_batch_size=50, learning_rate=5e-3, max_num_epochs=4)
     constants = {
-        room + "data.NUM_SIMULATIONS": 300,
-        room + "data.SIMULATIONS_PER_PAIR": 5,
-        room + "data.DiscrepancyModel": lambda: model,
-        room + "scoring.NUM_SAMPLES": 40,
-        room + "candidates.TUNING": tuning,
-        room + "candidates.FINETUNING": replace(FINETUNING, max_num_epochs=2),
-        room + "candidates.REHEARSED": replace(REHEARSED, max_num_epochs=1),
-        "sbi_rope.finetuning.STEPS_IN_EPOCH": 3,
-        "sbi_rope.discrepancy.correction.TRAINING": dict.fromkeys(
-            ("embedding", "tuned", "input"),
-            Training(training_batch_size=50, learning_rate=5e-3, max_num_epochs=4),
+        "stacking.data.NUM_SIMULATIONS": 300,
+        "stacking.data.SIMULATIONS_PER_PAIR": 5,
+        "stacking.data.DiscrepancyModel": lambda: model,
+        "stacking.scoring.NUM_SAMPLES": 40,
+        "stacking.candidates.TUNING": CalibrationFinetuner(
+            rehearsal=1.0, learning_rate=0.02, max_num_epochs=3
         ),
-        "sbi_rope.discrepancy.correction.NUM_DRAWS": 50,
-        "sbi_rope.discrepancy.correction.NUM_COMPARED": 50,
-        "sbi_rope.discrepancy.unlabelled.SEARCH": Training(max_num_epochs=5),
-        "sbi_rope.discrepancy.unlabelled.NUM_HESSIANS": 1,
-        "sbi_rope.discrepancy.unlabelled.NUM_COMPONENTS": 5,
-        "sbi_rope.fit.MAX_LOWERED": 0,
+        "stacking.candidates.FINETUNING": replace(FINETUNING, max_num_epochs=2),
+        "stacking.candidates.REHEARSED": replace(REHEARSED, max_num_epochs=1),
+        "finetuning.STEPS_IN_EPOCH": 3,
+        "discrepancy.correction.TRAINING": dict.fromkeys(TRAINING, correcting),
+        "discrepancy.correction.NUM_DRAWS": 50,
+        "discrepancy.correction.NUM_COMPARED": 50,
+        "discrepancy.unlabelled.SEARCH": Training(max_num_epochs=5),
+        "discrepancy.unlabelled.NUM_HESSIANS": 1,
+        "discrepancy.unlabelled.NUM_COMPONENTS": 5,
+        "fit.MAX_LOWERED": 0,
     }
     with ExitStack() as patches:
         for name, value in constants.items():
-            patches.enter_context(patch(name, value))
+            patches.enter_context(patch(f"sbi_rope.{name}", value))
         yield
 
 

@@ -11,15 +11,16 @@ from torch import Tensor, nn
 from sbi_rope._random import seeded
 from sbi_rope._sbi import ConditionalEstimator, embedding_of, has_parameters
 from sbi_rope._standardisation import Standardisation
-from sbi_rope.data import group_means, groups_of
+from sbi_rope.data import Pairs, group_means, groups_of
 from sbi_rope.density.flow import Flow
 from sbi_rope.discrepancy.model import DiscrepancyModel, expected_means
+from sbi_rope.discrepancy.parameters import learn_parameters
 from sbi_rope.discrepancy.posterior import (
+    SMALLEST_ERROR,
     Discrepancy,
     DiscrepancyDraws,
-    noise_scale,
+    rounding,
 )
-from sbi_rope.discrepancy.regression import SMALLEST_NOISE
 from sbi_rope.discrepancy.unlabelled import LaplaceDiscrepancy
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.fit import Courses, History, Training, fit
@@ -31,6 +32,7 @@ __all__ = [
     "Space",
     "correct_flow",
     "fit_discrepancy",
+    "fit_version",
     "in_units",
     "network_of",
     "surprise",
@@ -40,22 +42,19 @@ __all__ = [
 # What is corrected: h(x), x itself, or g(x) with nets g tuned on other pairs. In the
 # last case simulations are still represented by h(x), because g is tuned towards h.
 Space = Literal["embedding", "input", "tuned"]
+# What a version is trained with: a discrepancy, and the probabilities with which it
+# draws simulations, which are equal if None.
+Version = tuple[Discrepancy | LaplaceDiscrepancy, Tensor | None]
 
-# The number of draws of the discrepancy for a training, and the limit on the entries of
-# all draws together. Embeddings of a hundred dimensions get fewer draws.
-NUM_DRAWS, MAX_ENTRIES = 2000, 2**24
-# Where this limits the draws, each of them serves so many simulations of a step.
-BLOCK = 40
+# Draws of the discrepancy for a training, and the limit on the entries of all together.
+# Where it limits the draws, each of them serves a block of simulations of a step.
+NUM_DRAWS, MAX_ENTRIES, BLOCK = 2000, 2**24, 40
 # A discrepancy of more entries takes minutes and many GB of memory.
 MOST_ENTRIES = 500
-# Smallest standard deviation of the error of the entry with most noise, in standard
-# deviations of simulations. It is smaller for x, which can be known more precisely than
-# an embedding.
-SMALLEST_ERROR = {"embedding": 0.01, "tuned": 0.01, "input": 0.003}
 # More standard deviations than this refute that the simulator is right.
 LARGEST_SURPRISE = 5.0
-# Simulations in a step, and steps in a course. The density behind a net adapts
-# within a hundred steps; a whole network takes longer.
+# Simulations in a step, and steps in a course. A whole network adapts slower than a
+# density behind a net.
 BEHIND_NET = Training(training_batch_size=80, learning_rate=1e-2, max_num_epochs=250)
 TRAINING = {
     "embedding": BEHIND_NET,
@@ -64,26 +63,19 @@ TRAINING = {
 }
 # Corrected simulations on which the loss before and after a course is compared.
 NUM_COMPARED = 1920
-# Courses follow each other until one gains less than 0.01 nats. In a stack, where many
-# versions are trained, a single course is enough for most, but not for images: only if
-# the loss still falls by so many nats in its last quarter, a longer one follows.
-# Without an embedding net it adds nothing. Chosen on calibration data, see
-# benchmarks/choices.md.
+# Courses follow each other until one gains less than 0.01 nats. In a stack a single one
+# is enough for most: a longer one follows only if the loss still falls by so many nats
+# in its last quarter. Chosen on calibration data, see benchmarks/choices.md.
 COURSES = Courses(min_gain=0.01)
-IN_A_STACK = Courses(min_gain=0.01, min_fall=0.3, max_num=2, growth=4)
-IN_A_STACK_OF_INPUT = replace(IN_A_STACK, growth=2)
-IN_A_STACK_WITHOUT_NET = replace(IN_A_STACK, max_num=1)
+IN_A_STACK = Courses(min_gain=0.01, min_fall=0.3, max_num=2)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class Correction:
-    """Copies of NPE that were trained on corrected simulations, and their losses.
-
-    ``constants`` is a layer that replaces entries without variation in simulations, to
-    put behind an embedding net of real observations.
-    """
+    """Copies of NPE that were trained on corrected simulations, and their losses."""
 
     flow: Flow
+    # Replaces entries that do not vary in simulations, behind a net of real x.
     constants: nn.Module
     histories: list[History]
 
@@ -112,33 +104,42 @@ def fit_discrepancy(
     moments: Moments,
     standardisation: Standardisation,
     model: DiscrepancyModel,
-    *,
     weights: Tensor | None = None,
     groups: Tensor | None = None,
 ) -> Discrepancy:
-    """Fit the model to calibration pairs, in standard deviations of simulations.
-
-    That the simulator is right counts as impossible if the pairs refute it by
-    themselves, see :func:`surprise`. The evidence alone would not: with few pairs and
-    many entries, a right simulator that fits badly can have more of it than all
-    discrepancies, each of which has many coefficients to learn.
-
-    The representations z of the real observations have the shape ``(n, l)``, and
-    ``standardisation`` is that of z over simulations from the prior. Weights and groups
-    are those of :meth:`DiscrepancyModel.fit`.
-    """
+    """Fit the model to pairs, represented by z ``(n, l)``, in units of simulations."""
     if not standardisation.varies.any():
         raise InvalidInputError(
             "Expected simulations that differ from each other; got the same embedding "
             "(or the same x) for all of them."
         )
     z, unit = standardisation(z.double()), in_units(moments, standardisation)
-    means, covariances = unit.means, unit.covariance
-    found = surprise(z, means, covariances, weights=weights, groups=groups)
+    # With few pairs and many entries, a right simulator that fits badly can have more
+    # evidence than all discrepancies, each of which has many coefficients to learn.
+    found = surprise(z, unit.means, unit.covariance, weights, groups)
     if found > LARGEST_SURPRISE and model.probability_of_none < 1.0:
         model = replace(model, probability_of_none=0.0)
-    covariance = covariances.mean(dim=0)
-    return model.fit(z, means, covariance, weights=weights, groups=groups)
+    covariance = unit.covariance.mean(dim=0)
+    return model.fit(z, unit.means, covariance, weights=weights, groups=groups)
+
+
+def fit_version(
+    pairs: Pairs,
+    z: Tensor,
+    moments: Moments,
+    simulations: tuple[Tensor, Tensor],
+    model: DiscrepancyModel,
+    *,
+    learn_prior: bool,
+) -> tuple[Discrepancy, Tensor | None]:
+    """Return what pairs say of the discrepancy, and of the parameters if learned."""
+    theta_s, z_s = simulations
+    unit = Standardisation(z_s.double())
+    found = fit_discrepancy(z, moments, unit, model, pairs.weight, pairs.group)
+    if not learn_prior:
+        return found, None
+    weights = pairs.shared_weight
+    return found, learn_parameters(pairs.theta, theta_s, weights=weights).probabilities
 
 
 def in_units(moments: Moments, standardisation: Standardisation) -> Moments:
@@ -155,28 +156,22 @@ def tuning_targets(
     z: Tensor,
     moments: Moments,
     standardisation: Standardisation,
-    *,
     weights: Tensor | None = None,
     groups: Tensor | None = None,
+    *,
     seed: int | None = None,
 ) -> Tensor:
-    r"""Return the targets of the tuning, :math:`E[h(S(\theta_i)) \mid y_i, x_i]`.
+    r"""Return the targets ``(n, l)`` of the tuning, :math:`E[h(S(\theta)) \mid y, x]`.
 
-    A label y that leaves parameters open leaves open the target, too. Its average under
-    the prior would not do: a net that is tuned to it learns to forget what x says about
-    these parameters. The average is therefore also given x, under the discrepancy model
-    that is fitted to these pairs.
-
-    The arguments are those of :func:`fit_discrepancy`, and a seed of the averages. The
-    shape of the targets is that of z.
+    A net that is tuned to averages given a partial label y alone would forget what x
+    says about the other parameters. They are therefore also given x, under the
+    discrepancy model that is fitted to these pairs.
     """
-    discrepancy = fit_discrepancy(
-        z, moments, standardisation, DiscrepancyModel(), weights=weights, groups=groups
-    )
+    model = DiscrepancyModel()
+    found = fit_discrepancy(z, moments, standardisation, model, weights, groups)
+    possible = standardisation(moments.means)
     with seeded(seed):
-        means = expected_means(
-            discrepancy, standardisation(z.double()), standardisation(moments.means)
-        )
+        means = expected_means(found, standardisation(z.double()), possible)
     return standardisation.undo(means).to(z)
 
 
@@ -184,7 +179,6 @@ def surprise(
     z: Tensor,
     means: Tensor,
     covariances: Tensor,
-    *,
     weights: Tensor | None = None,
     groups: Tensor | None = None,
 ) -> float:
@@ -197,19 +191,15 @@ def surprise(
     would have the mean :math:`E_i = \operatorname{tr}(C^{-1} C_i)` and, if it were
     Gaussian, the variance :math:`V_i = 2 \operatorname{tr}((C^{-1} C_i)^2)`. Here C is
     the mean of all :math:`C_i`. In the worst case, pairs of a group have everything in
-    common, so that each group counts as one pair, with the means of its T, E and V.
-
-    The means :math:`m_i` have the shape ``(n, R, l)``, and the nearest of R counts. The
-    covariances :math:`C_i` have the shape ``(n, l, l)``.
+    common, so that each group counts as one pair, with the means of its T, E and V. Of
+    several possible means, ``(n, R, l)``, the nearest counts.
     """
-    rounded = SMALLEST_NOISE * noise_scale(covariances.mean(dim=0))
-    covariances = covariances + rounded.square().diag()
+    covariances = covariances + rounding(covariances.mean(dim=0)).diag()
     residual = z.to(covariances)[:, None] - means
     factor = torch.linalg.cholesky(covariances.mean(dim=0))
     white = torch.linalg.solve_triangular(factor, residual.mT, upper=False)
     found = white.square().sum(dim=1).amin(dim=1)
-    inverse = torch.cholesky_inverse(factor)
-    relative = inverse @ covariances
+    relative = torch.cholesky_inverse(factor) @ covariances
     expected = relative.diagonal(dim1=1, dim2=2).sum(dim=1)
     variance = 2 * (relative * relative.mT).sum(dim=(1, 2))
     w = torch.ones_like(found) if weights is None else weights.to(found)
@@ -223,15 +213,14 @@ def surprise(
 def correct_flow(
     estimator: ConditionalEstimator,
     simulations: tuple[Tensor, Tensor],
-    discrepancies: Sequence[Discrepancy | LaplaceDiscrepancy],
+    versions: Sequence[Version],
     *,
     space: Space,
-    probabilities: Sequence[Tensor | None],
     num_steps: int | None = None,
     in_a_stack: bool = False,
     show_progress_bars: bool = False,
 ) -> Correction:
-    r"""Train copies of NPE on simulations as they would be observed, all at once.
+    r"""Train a copy of NPE for each version on corrected simulations, all at once.
 
     .. math::
         \min_q \; \mathbb E_{(A, b, \Sigma') \mid \text{pairs}}\;
@@ -239,28 +228,18 @@ def correct_flow(
         \bigl[-\log q(\theta \mid A z_s + b + e)\bigr]
 
     The optimum is the posterior with the discrepancy integrated out. Every step draws
-    new rows, new corrections and new errors. A network of usual size does not overfit
-    them, so that no simulations are held out. With ``space="tuned"`` the caller puts a
-    tuned net and the constants in the place of h.
-
-    Args:
-        estimator: The estimator of NPE; it is not changed.
-        simulations: Parameters from the prior, shape ``(n_s, d)``, and the
-            representation of a simulation of each, shape ``(n_s, l)``.
-        discrepancies: The discrepancy of each copy, in standard deviations of these.
-        space: With ``"input"`` all of NPE is trained, otherwise the density alone.
-        probabilities: Those with which each copy draws simulations; equal if None.
-        num_steps: Gradient steps of a single course. If None, courses follow each
-            other, whose length depends on the space.
-        in_a_stack: Whether to stop earlier, because many copies are trained.
-        show_progress_bars: Whether to show the loss during training.
+    new rows, corrections and errors, so that no simulations are held out. With
+    ``space="input"`` all of NPE is trained, otherwise the density alone, for
+    ``num_steps`` or in courses, which end earlier in a stack. With ``"tuned"`` the
+    caller puts a tuned net and the constants in the place of h. Simulations are
+    parameters from the prior and representations, ``(n_s, d)`` and ``(n_s, l)``.
     """
     theta, z = simulations
     unit = Standardisation(z.double())
-    z, count = unit(z.double()), len(discrepancies)
-    constants = nn.Identity() if unit.varies.all() else SimulatedConstants(unit)
-    net = embedding_of(estimator)
+    z, count = unit(z.double()), len(versions)
+    net, constants = embedding_of(estimator), nn.Identity()
     if not unit.varies.all():
+        constants = SimulatedConstants(unit)
         order = (constants, net) if space == "input" else (net, constants)
         net = nn.Sequential(*order)
     flow = Flow.of([estimator] * count, nets=[net] * (count if space == "input" else 1))
@@ -269,11 +248,11 @@ def correct_flow(
     size = max(1, min(NUM_DRAWS, MAX_ENTRIES // z.shape[1] ** 2 // count))
     block = 1 if size == NUM_DRAWS else BLOCK
     draws = DiscrepancyDraws.joined(
-        one.sample(size, smallest_error=SMALLEST_ERROR[space]) for one in discrepancies
+        one.sample(size, smallest_error=SMALLEST_ERROR[space]) for one, _ in versions
     )
     equal = torch.full((len(theta),), 1.0 / len(theta), dtype=torch.double)
-    upper = torch.stack([equal if p is None else p.cpu() for p in probabilities])
-    upper = upper.double().cumsum(dim=1)
+    upper = torch.stack([equal if p is None else p.cpu().double() for _, p in versions])
+    upper = upper.cumsum(dim=1)
 
     def batch(count: int) -> tuple[Tensor, Tensor]:
         """Draw theta and corrected z for each copy, ``(E, count, ...)``."""
@@ -298,9 +277,9 @@ def correct_flow(
     training = TRAINING[space]
     courses = Courses(math.inf) if num_steps else COURSES
     if in_a_stack:
-        courses = IN_A_STACK_OF_INPUT if space == "input" else IN_A_STACK
+        courses = replace(IN_A_STACK, growth=2 if space == "input" else 4)
         if not has_parameters(embedding_of(estimator)):
-            courses = IN_A_STACK_WITHOUT_NET
+            courses = replace(courses, max_num=1)
     histories = fit(
         network,
         lambda step: [batch(training.training_batch_size)],
@@ -314,15 +293,11 @@ def correct_flow(
         label="Correcting NPE",
         show_progress_bars=show_progress_bars,
     )
-    return Correction(flow=flow, constants=constants, histories=histories)
+    return Correction(flow, constants, histories)
 
 
 class SimulatedConstants(nn.Module):
-    """Sets entries that are the same in all simulations to their simulated value.
-
-    The density has never seen these entries vary, so that its answer to another value
-    would be arbitrary.
-    """
+    """Sets entries that never vary in simulations to their simulated value."""
 
     varies: Tensor
     values: Tensor

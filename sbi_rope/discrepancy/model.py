@@ -4,6 +4,8 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from statistics import fmean
 
 import numpy as np
 import torch
@@ -11,9 +13,8 @@ from torch import Tensor
 
 from sbi_rope._random import seeded
 from sbi_rope.data import groups_of
-from sbi_rope.discrepancy.posterior import Discrepancy, noise_scale
+from sbi_rope.discrepancy.posterior import Discrepancy, rounding
 from sbi_rope.discrepancy.regression import (
-    SMALLEST_NOISE,
     Conditional,
     GroupErrors,
     Regressions,
@@ -25,17 +26,14 @@ from sbi_rope.tensors import as_batch
 
 __all__ = ["DiscrepancyModel", "expected_means"]
 
-# How many times as large the variance between the groups is as the one within them, and
-# their prior probabilities. Those below .2 matter for large groups only. Together they
-# are as probable as one of the others.
+# Ratios of the variance between groups to the one within them, and their prior. Those
+# below .2 matter for large groups only; together they are as probable as another one.
 VARIANCE_RATIOS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 PRIOR_OF_RATIOS = (1 / 30,) * 5 + (1 / 6,) * 5
 # Chains that are run side by side, which costs hardly more than one of them.
 NUM_CHAINS = 10
-# Imputations of a chain that are left out, because they depend on where it started, and
-# those that the posterior is averaged over. So many later imputations belong to each of
-# them. If labels are as noisy as the prior is wide, imputations that far apart are
-# nearly independent.
+# The first imputations of a chain depend on its start. Those that are kept are so far
+# apart that they are nearly independent for labels as noisy as the prior is wide.
 NUM_WARM_UP, NUM_KEPT, APART = 100, 2, 30
 # Numbers in the largest tensor, unless one chain needs more.
 MAX_ENTRIES = 2**22
@@ -66,30 +64,24 @@ class DiscrepancyModel(Settings):
 
     so that the posterior has the same form and the evidence has a closed form. The
     shape V is I, or :math:`D^2` with the noise of simulations in each entry, relative
-    to the largest: an entry that is measured more precisely than others may have a
-    smaller error, too. The noise in K keeps what is uncertain about A from adding more
-    than a quarter of :math:`\Sigma` to the noise. V and the hyper-parameters k, s and
-    :math:`\nu` are averaged over a grid, weighted by their evidence, so that there is
-    nothing to choose.
+    to the largest: a precise entry may have a smaller error, too. The noise in K keeps
+    what is uncertain about A from adding more than a quarter of :math:`\Sigma` to the
+    noise. V and the hyper-parameters k, s and :math:`\nu` are averaged over a grid,
+    weighted by their evidence, so that there is nothing to choose.
 
     Recordings of one person or specimen can have errors in common. If these have the
     correlation :math:`\rho`, a group of k pairs counts as
-
-    .. math:: \frac{k}{1 + (k - 1)\, \rho}
-
-    independent ones (Kish's design effect). For :math:`\rho` its mean over a grid is
-    taken, weighted by the evidence of matrix normal errors with this correlation. The
-    covariance of the errors is still that of all pairs, because a person can be unusual
-    in some entries of z only. Whether the simulator is right is judged with each group
-    as one pair.
+    :math:`k / (1 + (k - 1)\, \rho)` independent ones (Kish's design effect), with the
+    mean of :math:`\rho` over a grid, weighted by the evidence. The covariance of the
+    errors is that of all pairs, because a person can be unusual in some entries of z
+    only. Whether the simulator is right is judged with each group as one pair.
 
     The average contains the model :math:`z_i \mid \theta_i \sim \mathcal N(m_i, C)`, in
-    which the simulator is right. Before any pair is seen its probability is
-    ``probability_of_none``. If the simulator is right, the probability goes to one with
-    more pairs, and nothing is corrected. An exception are simulators whose noise varies
-    by a factor of several with the parameters, because C is the same for all pairs. If
-    the pairs by themselves refute that the simulator is right, :class:`DiscrepancyNPE`
-    and stacks set the probability to zero.
+    which the simulator is right. If it is, the probability of this model goes to one
+    with more pairs, and nothing is corrected. An exception are simulators whose noise
+    varies by a factor of several with the parameters, because C is the same for all
+    pairs. :class:`DiscrepancyNPE` and stacks set the probability to zero if the pairs
+    refute the simulator by themselves.
 
     All quantities are in standard deviations of simulations from the prior.
 
@@ -134,10 +126,9 @@ class DiscrepancyModel(Settings):
         r"""Return the posterior of the discrepancy given calibration pairs, in float64.
 
         If parameters are not known exactly, ``mean`` holds the means at R parameters
-        that are equally probable before the observation is seen. The parameters are
-        then imputed and the discrepancy is drawn in turn (data augmentation, a Gibbs
-        sampler), in ten chains. The posterior is the average over two imputations of
-        each chain, after 130 and after 160 rounds.
+        that are equally probable before the observation is seen. Ten chains of a Gibbs
+        sampler then impute the parameters and draw the discrepancy in turn (data
+        augmentation). The posterior is the average over two imputations of each chain.
 
         References:
             | The Calculation of Posterior Distributions by Data Augmentation (Tanner
@@ -151,10 +142,10 @@ class DiscrepancyModel(Settings):
             covariance: C, the covariance of simulations at one parameter, averaged over
                 the pairs, shape ``(l, l)``.
             weights: How many pairs each pair counts as, shape ``(n,)``; one if None.
-            groups: A number for each pair, shape ``(n,)``. The errors of pairs with the
-                same number can have something in common, such as those of recordings of
-                one person. None if all are independent. Do not divide the weights by
-                the number of recordings as well: a group counts as fewer pairs anyway.
+            groups: A number for each pair, shape ``(n,)``. Pairs with the same number,
+                such as recordings of one person, can have errors in common. None if all
+                are independent. Do not divide the weights by the number of recordings
+                as well: a group counts as fewer pairs anyway.
             seed: Seed of the imputations.
         """
         width = np.shape(z)[-1:]
@@ -164,8 +155,7 @@ class DiscrepancyModel(Settings):
         if possible == (1,):
             mean = mean[:, 0]
         covariance = as_batch("covariance", covariance, width, rows=width[0]).to(z)
-        smallest = SMALLEST_NOISE * noise_scale(covariance)
-        noise = covariance + smallest.square().diag()
+        noise = covariance + rounding(covariance).diag()
         weights = torch.ones(len(z)) if weights is None else weights
         weights = as_batch("weights", weights, (), rows=len(z)).to(z)
         if groups is not None:
@@ -181,9 +171,7 @@ class DiscrepancyModel(Settings):
             correlations = self._correlations_within(groups, z, mean, noise)
             return independent_pairs(groups, correlations, weights)
 
-        def conditional(mean: Tensor, weights: Tensor) -> Conditional:
-            return self._conditional(z, mean, noise, weights, once)
-
+        conditional = partial(self._conditional, z=z, noise=noise, once=once)
         if mean.ndim == 2:
             [discrepancy] = conditional(mean[None], counts(mean[None])).posteriors()
             return discrepancy
@@ -191,25 +179,22 @@ class DiscrepancyModel(Settings):
             return impute(z, mean, conditional, counts)
 
     def _conditional(
-        self, z: Tensor, mean: Tensor, noise: Tensor, weights: Tensor, once: Tensor
+        self, mean: Tensor, weights: Tensor, *, z: Tensor, noise: Tensor, once: Tensor
     ) -> Conditional:
-        """Return the posteriors given B sets of means, shape ``(B, n, l)``.
-
-        ``once`` are the weights if each group counts as one pair, shape ``(n,)``.
-        """
-        precisions = self.gain_precisions
+        """Return the posteriors given B sets of means, shape ``(B, n, l)``."""
+        settings, precisions = self._settings, self.gain_precisions
         regressions = Regressions.of(z, mean, precisions, weights, noise)
-        log_evidence = judged = regressions.log_evidence(self._settings)
+        log_evidence = judged = regressions.log_evidence(settings)
         if once is not weights:
             as_one_pair = Regressions.of(z, mean, precisions, once, noise)
-            judged = as_one_pair.log_evidence(self._settings)
+            judged = as_one_pair.log_evidence(settings)
         average = judged.logsumexp(dim=(1, 2)) - math.log(judged[0].numel())
         right = log_density_of_right(z - mean, noise, once)
         prior = torch.logit(average.new_tensor(self.probability_of_none))
         return Conditional(
             regressions=regressions,
             log_evidence=log_evidence,
-            settings=self._settings,
+            settings=settings,
             noise=noise,
             average=average,
             right=right,
@@ -244,22 +229,12 @@ def impute(
     conditional: Callable[[Tensor, Tensor], Conditional],
     counts: Callable[[Tensor], Tensor],
 ) -> Discrepancy:
-    r"""Average the posterior over imputed parameters, by Gibbs sampling.
+    r"""Average the posterior over imputed means, by Gibbs sampling in C chains.
 
-    Given a gain, an offset and an error, the possible means :math:`m_{ir}` of an
-    observation have the probabilities
-
-    .. math:: p_{ir} \propto \mathcal N(z_i; A m_{ir} + b, \Sigma).
-
-    One of them is drawn for each observation. Given these means the posterior of the
-    discrepancy has a closed form, of which the next gain, offset and error are drawn.
-    C chains of such draws are independent of each other.
-
-    The shape of ``possible`` is ``(n, R, l)``. ``conditional`` returns the posteriors
-    given C sets of means, ``(C, n, l)``, and how many pairs each of them counts as, and
-    ``counts`` returns the latter, ``(n,)`` or ``(C, n)``. It is asked at the start, and
-    again for the imputations that are kept. The two evidences, ``probability_of_none``
-    and ``num_independent`` of what is returned are averages over these.
+    We draw one of the possible means :math:`m_{ir}` of each observation, ``(n, R, l)``,
+    with probabilities :math:`p_{ir} \propto \mathcal N(z_i; A m_{ir} + b, \Sigma)`, and
+    then A, b and :math:`\Sigma` from their posterior given these means, ``(C, n, l)``,
+    and given how many pairs each counts as, ``(n,)`` or ``(C, n)``.
     """
     mean = possible.mean(dim=1).expand(NUM_CHAINS, -1, -1)
     weights = counts(mean)
@@ -280,20 +255,16 @@ def impute(
         terms=tuple(term for one in kept for term in one.terms),
         shares=shares / total,
         noise=given.noise,
-        probability_of_none=_mean([one.probability_of_none for one in kept]),
-        log_evidence=_mean([one.log_evidence for one in kept]),
-        log_evidence_of_none=_mean([one.log_evidence_of_none for one in kept]),
+        probability_of_none=fmean(one.probability_of_none for one in kept),
+        log_evidence=fmean(one.log_evidence for one in kept),
+        log_evidence_of_none=fmean(one.log_evidence_of_none for one in kept),
         num_pairs=len(z),
-        num_independent=_mean([one.num_independent for one in kept]),
+        num_independent=fmean(one.num_independent for one in kept),
     )
 
 
 def expected_means(discrepancy: Discrepancy, z: Tensor, possible: Tensor) -> Tensor:
-    r"""Return the means of observations that are expected given them.
-
-    This is :math:`\sum_r p_{ir}\, m_{ir}` with the probabilities of :func:`impute`,
-    averaged over the posterior of the discrepancy. Its shape is ``(n, l)``.
-    """
+    r"""Return the posterior mean of :math:`\sum_r p_{ir}\, m_{ir}`, ``(n, l)``."""
     noise = discrepancy.noise
     right = torch.eye(len(noise)).to(noise), noise.new_zeros(len(noise)), noise
     drawn = []
@@ -341,7 +312,3 @@ def _probabilities(
         for seen, to_seen in parts
     ]
     return torch.softmax(-torch.cat(distances).square() / 2, dim=-1)
-
-
-def _mean(values: list[float]) -> float:
-    return sum(values) / len(values)

@@ -16,16 +16,15 @@ from sbi_rope._sbi import (
     estimator_of,
     posterior_from,
 )
-from sbi_rope._standardisation import Standardisation, warn_of_far_entries
+from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope.density import MixturePosterior
 from sbi_rope.discrepancy.correction import (
     Space,
     correct_flow,
-    fit_discrepancy,
+    fit_version,
     network_of,
 )
 from sbi_rope.discrepancy.model import DiscrepancyModel
-from sbi_rope.discrepancy.parameters import learn_parameters
 from sbi_rope.discrepancy.posterior import Discrepancy
 from sbi_rope.discrepancy.report import DiscrepancyReport, report_discrepancy
 from sbi_rope.ensemble import Ensemble
@@ -47,9 +46,9 @@ SIMULATIONS_PER_PAIR, NUM_FOLDS = 100, 5
 class DiscrepancyNPE(Method):
     r"""NPE for real observations, with the discrepancy of the simulator integrated out.
 
-    A Bayesian linear model describes how real observations follow from simulations
-    (:class:`DiscrepancyModel`). It is fitted to the calibration pairs. Simulations are
-    then corrected by draws from its posterior, and NPE is trained on them for some more
+    A Bayesian linear model of how real observations follow from simulations
+    (:class:`DiscrepancyModel`) is fitted to the calibration pairs. Simulations are then
+    corrected by draws from its posterior, and NPE is trained on them for some more
     seconds. The result is an ordinary amortised posterior for any observation.
 
     What is corrected depends on ``space``:
@@ -59,13 +58,11 @@ class DiscrepancyNPE(Method):
       of NPE is trained. This is better if h discards information that is needed when
       the simulator is wrong.
     - ``"tuned"``: five copies g of h are tuned as RoPE tunes its own, with rehearsal,
-      each without one fold of the pairs. The discrepancy is fitted to the remaining
-      difference between g of the pairs in that fold and h of simulations. The posterior
-      averages over the copies. This is for large nets that have never seen the effect
-      which the simulator lacks.
+      each without one fold of the pairs. The discrepancy is that between g of the pairs
+      in the fold and h of simulations. The posterior averages over the copies. This is
+      for large nets that have never seen the effect which the simulator lacks.
 
-    It uses simulations and the calibration set, and assumes that one linear correction
-    holds for all parameters. It works from a handful of pairs on;
+    One linear correction has to hold for all parameters. A handful of pairs is enough;
     ``docs/background/discrepancy.md`` says when it fails. FMPE and NPSE posteriors can
     be corrected too, except with ``space="tuned"``.
 
@@ -81,14 +78,12 @@ class DiscrepancyNPE(Method):
             appended simulations are used instead.
         space: What is corrected, see above.
         learn_prior: Whether to learn the distribution of real parameters from those of
-            the pairs, see :func:`~sbi_rope.discrepancy.learn_parameters`. The pairs
-            must then be drawn like the observations to be inferred. Otherwise, pass
-            False.
+            the pairs, see :func:`~sbi_rope.discrepancy.learn_parameters`. Pass False
+            unless the pairs are drawn like the observations to be inferred.
         model: The model of the discrepancy; ``DiscrepancyModel()`` if None.
         num_simulations: Simulations from the prior to train on, if none were appended.
-        num_steps: Gradient steps. If None, NPE is trained in courses of 200 steps (400
-            with ``"input"``), until a course lowers the loss by less than 0.01, at most
-            twelve.
+        num_steps: Gradient steps. If None, NPE is trained in at most twelve courses of
+            250 steps (400 with ``"input"``), until one gains less than 0.01 nats.
         npe_training: How NPE is trained; ``Training()`` if None.
         device: Where to train; data on other devices is moved there.
     """
@@ -145,41 +140,34 @@ class DiscrepancyNPE(Method):
         """Compare simulations with real observations, summary by summary.
 
         The method need not be trained, and with a simulator it needs no appended
-        simulations. The report is about x itself, whatever ``space`` is. Pairs with
-        equal parameters are taken for recordings of one person, whose errors may be
-        correlated. It says how many independent pairs they count as. Print it.
+        simulations. The report is about x itself, whatever ``space`` is.
 
         Args:
             summaries: A function from observations ``(n, *event)`` to a few summaries
-                of each, ``(n, k)``, such as the means of parts of an image, or mean and
-                spread of a set of trials. It may return a NumPy array. If None, the
-                summaries are the entries of x, which has to be a vector.
+                of each, ``(n, k)``, such as the means of parts of an image. It may
+                return a NumPy array. If None, they are the entries of a vector x.
             x_names: Names of the summaries; numbered if None.
             seed: Seed of the simulations, as in ``train``.
-            show_progress_bars: Whether to show the progress of slow simulations, and of
-                many summaries, as in ``train``.
+            show_progress_bars: As in ``train``.
 
         Returns:
-            The gain, shift and error of each summary with 95 % intervals, in the units
-            of x or of the summaries.
+            The gain, shift and error of each summary with 95 % intervals.
         """
         self._check_data("calibration")
         if self._simulator is None:
             self._check_data("simulations")
-        x = self._data.pairs.x
+        x, show = self._data.pairs.x, is_shown(show_progress_bars)
         if x.ndim != 2 and summaries is None:
             raise InvalidInputError(
                 f"Expected observations of shape (n, l); got {tuple(x.shape)}. Pass "
                 "`summaries=`, a function from x to shape (n, k)."
             )
-        show = is_shown(show_progress_bars)
 
         def summarised(x: Tensor) -> Tensor:
             if summaries is None:
                 return x
             found = summaries(x.clone())  # which may work in place
-            width = np.shape(found)[-1:]
-            name = "summaries(x)"
+            width, name = np.shape(found)[-1:], "summaries(x)"
             found = as_batch(name, found, width, rows=len(x), finite=False)
             return found.to(x.device)
 
@@ -188,17 +176,14 @@ class DiscrepancyNPE(Method):
             _, simulated = source.from_prior(
                 self.num_simulations, seed=0, progress=show
             )
-            x = as_batch("summaries of the pairs", summarised(x))
-            simulated = as_batch("summaries of simulations", summarised(simulated))
-            found = self._moments(source, summarised, progress=show)
-        report = report_discrepancy(
-            x,
-            found,
-            simulated,
-            model=self.model,
-            groups=self._data.pairs.group,
-            show_progress_bars=show,
-        )
+            report = report_discrepancy(
+                as_batch("summaries of the pairs", summarised(x)),
+                self._moments(source, summarised, progress=show),
+                as_batch("summaries of simulations", summarised(simulated)),
+                model=self.model,
+                groups=self._data.pairs.group,
+                show_progress_bars=show,
+            )
         return report if x_names is None else report.renamed(x_names)
 
     def _moments(
@@ -208,22 +193,20 @@ class DiscrepancyNPE(Method):
         return moments(source, pairs, SIMULATIONS_PER_PAIR, embed, progress=progress)
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
-        npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
+        show = show_progress_bars
+        npe, _ = self._trained_npe(show_progress_bars=show)
         estimator = estimator_of(npe)
         if self.space == "tuned":
             check_density(estimator, because="space='tuned' averages over nets")
-        pairs = self._data.pairs
+        pairs, source = self._data.pairs, self._source()
         warn_of_far_entries("x", pairs.x, embedding_of(estimator))
-        source = self._source()
         net = network_of(estimator, self.space)
-        found = self._moments(
-            source, lambda x: embed(net, x), progress=show_progress_bars
-        )
+        found = self._moments(source, lambda x: embed(net, x), progress=show)
         if self._data.count("simulations"):
             theta_s, x_s = self._data.simulations
         else:
             theta_s, x_s = source.from_prior(
-                self.num_simulations, seed=0, progress=show_progress_bars
+                self.num_simulations, seed=0, progress=show
             )
         if self.space == "input":
             as_batch("x", pairs.x)
@@ -231,24 +214,19 @@ class DiscrepancyNPE(Method):
         z, nets = embed(net, pairs.x), None
         if self.space == "tuned":
             nets, z = self._cross_fitted(
-                net, found.mean.to(z), x_s, show_progress_bars=show_progress_bars
+                net, found.mean.to(z), x_s, show_progress_bars=show
             )
-        probabilities = None
-        if self.learn_prior:
-            probabilities = learn_parameters(pairs.mean, theta_s).probabilities
-        z_s = embed(net, x_s)
-        unit = Standardisation(z_s.double())
-        self._discrepancy = fit_discrepancy(
-            z, found, unit, self.model, groups=pairs.group
-        )
+        simulations = theta_s, embed(net, x_s)
+        given, learn_prior = (pairs, z, found, simulations), self.learn_prior
+        version = fit_version(*given, self.model, learn_prior=learn_prior)
+        self._discrepancy, _ = version
         correction = correct_flow(
             estimator,
-            (theta_s, z_s),
-            [self._discrepancy],
+            simulations,
+            [version],
             space=self.space,
-            probabilities=[probabilities],
             num_steps=self.num_steps,
-            show_progress_bars=show_progress_bars,
+            show_progress_bars=show,
         )
         [history], flow = correction.histories, correction.flow
         if nets is None:
@@ -261,11 +239,7 @@ class DiscrepancyNPE(Method):
     def _cross_fitted(
         self, h: nn.Module, targets: Tensor, x_s: Tensor, *, show_progress_bars: bool
     ) -> tuple[Ensemble, Tensor]:
-        """Tune a copy of h without each fold of the pairs, and embed the fold with it.
-
-        A net embeds the pairs that it was tuned on too close to their simulations. Only
-        other pairs show the discrepancy that remains.
-        """
+        """Tune a copy of h without each fold, and embed the fold with it."""
         pairs = self._data.pairs
         if pairs.num_groups == 1:
             raise InvalidInputError(

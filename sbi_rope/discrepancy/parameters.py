@@ -1,7 +1,8 @@
 r"""The distribution of parameters, learned from those of the calibration pairs."""
 
 import math
-from dataclasses import dataclass
+from statistics import fmean
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,35 +20,26 @@ __all__ = [
     "probability_of_prior",
 ]
 
-# Draws of the prior that the parameters of pairs are compared with.
-NUM_FROM_PRIOR = 10_000
-
-# Draws of each label that is not exact.
-NUM_SETS = 10
-# The prior's mean and covariance count as much as this number of pairs. The results are
-# averaged, weighted by their evidence.
+# Draws of the prior that the parameters of pairs are compared with, and draws of each
+# label that is not exact.
+NUM_FROM_PRIOR, NUM_SETS = 10_000, 10
+# The prior's mean and covariance count as much as one of these numbers of pairs.
 STRENGTHS = (2.0, 5.0, 10.0, 30.0, 100.0)
-# Parameters of pairs are said not to follow the prior if this is less probable. At most
-# one in 19 sets of pairs from the prior gets there by chance, because the two were
-# equally probable before (Markov's inequality).
+# Parameters of pairs are said not to follow the prior if this is less probable. By
+# Markov's inequality, at most one in 19 sets of pairs from the prior gets there.
 IMPROBABLE = 0.05
 # Scores of labels are cut off where one of so many sets of pairs from the prior has a
-# score at one end. The score of a label on a bound would have no end with ever more
-# simulations, although rounding alone puts labels there.
+# score at one end. Rounding puts labels on a bound, whose scores have no end.
 SETS_CUT_OFF = 20
 # Normal scores of a parameter with a more frequent value are not normal.
 MAX_SHARE = 0.05
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ParameterDistribution:
-    """Probabilities that make simulations from the prior follow the real parameters.
+class ParameterDistribution(NamedTuple):
+    """The probability of each simulation, ``(n,)``, and that of the prior.
 
-    Attributes:
-        probabilities: The probability of each simulation, shape ``(n,)``; they sum to
-            one.
-        probability_of_prior: The probability that real parameters follow the prior;
-            0.5 if all are discrete.
+    With these, simulations from the prior follow the real parameters. If all parameters
+    are discrete, the probability that the real ones follow the prior is 0.5.
     """
 
     probabilities: Tensor
@@ -68,26 +60,24 @@ def learn_parameters(
         \Lambda \sim \mathrm{IW}(c\, R, c + d + 1), \quad
         \mu \mid \Lambda \sim \mathcal N(0, \Lambda / c),
 
-    averaged over values of c by their evidence. The alternative is that real parameters
-    follow the prior, with a probability of one half before any pair is seen and
-    :math:`\pi` afterwards. The predictive density of the model is a mixture t(u) of
-    Student t densities, and simulations from the prior are drawn with probabilities
-    proportional to
+    averaged over values of c by their evidence, so that the predictive density is a
+    mixture t(u) of Student t densities. The alternative is that real parameters follow
+    the prior, with a probability of one half before any pair is seen and :math:`\pi`
+    afterwards. Simulations from the prior are drawn with probabilities proportional to
 
     .. math::
         \pi + (1 - \pi)\, t(u) / \mathcal N(u; 0, R) .
 
     Discrete parameters, of which more than one in twenty simulations share a value, are
-    left out: they stay distributed as in the prior, given the others.
-    Scores of pairs are cut off where only one of twenty sets of pairs from the prior
-    reaches, so that labels on a bound do not count for more with more simulations.
+    left out: they stay distributed as in the prior, given the others. Scores of pairs
+    are cut off where one of twenty sets of pairs from the prior reaches, so that labels
+    on a bound do not count for more with more simulations.
 
     Args:
-        theta_cal: Parameters of the pairs, shape ``(n_c, d)``. Parameters that appear
-            more than once count once, because several recordings of one person are one
-            draw from the distribution. Of labels that are not exact, R draws of the
-            parameters of each, shape ``(n_c, R, d)``. The probabilities are then
-            averages over up to ten sets of draws.
+        theta_cal: Parameters of the pairs, shape ``(n_c, d)``. Equal ones count once,
+            because several recordings of one person are one draw from the distribution.
+            Of labels that are not exact, R draws of each, shape ``(n_c, R, d)``. The
+            probabilities are then averages over up to ten sets of draws.
         theta: Parameters of at least two simulations from the prior, shape ``(n, d)``.
         weights: How many draws from the distribution each pair counts as, shape
             ``(n_c,)``; one if None. The weights of equal parameters are added.
@@ -98,17 +88,16 @@ def learn_parameters(
     if weights is not None:
         weights = as_batch("weights", weights, (), rows=len(theta_cal))
         weights = weights.to(theta_cal.device, torch.double)
-    is_continuous = [not _is_discrete(column) for column in theta.T]
-    if not any(is_continuous):
-        uniform = theta.new_full((len(theta),), 1.0 / len(theta), dtype=torch.double)
-        return ParameterDistribution(probabilities=uniform, probability_of_prior=0.5)
+    most = torch.stack([one.unique(return_counts=True)[1].max() for one in theta.T])
+    is_continuous = most <= max(1.0, MAX_SHARE * len(theta))
+    uniform = theta.new_full((len(theta),), 1.0 / len(theta), dtype=torch.double)
+    if not is_continuous.any():
+        return ParameterDistribution(uniform, 0.5)
     sets = theta_cal.unbind(dim=1)[:NUM_SETS] if theta_cal.ndim == 3 else [theta_cal]
     parts = [_learn(draws, theta, weights, is_continuous) for draws in sets]
-    of_prior = [part.probability_of_prior for part in parts]
-    return ParameterDistribution(
-        probabilities=torch.stack([part.probabilities for part in parts]).mean(dim=0),
-        probability_of_prior=sum(of_prior) / len(of_prior),
-    )
+    mixed = [p * uniform + (1.0 - p) * ratio for p, ratio in parts]
+    of_prior = fmean(p for p, _ in parts)
+    return ParameterDistribution(torch.stack(mixed).mean(dim=0), of_prior)
 
 
 def probability_of_prior(pairs: Pairs, prior: Distribution, *, seed: int = 0) -> float:
@@ -119,21 +108,15 @@ def probability_of_prior(pairs: Pairs, prior: Distribution, *, seed: int = 0) ->
     return learn_parameters(pairs.theta, theta, weights=weights).probability_of_prior
 
 
-def _is_discrete(column: Tensor) -> bool:
-    """Tell whether many draws of a parameter share a value."""
-    _, counts = column.unique(return_counts=True)
-    most = int(counts.max())
-    return most > 1 and most > MAX_SHARE * len(column)
-
-
 def is_improbable(probability_of_prior: float | None) -> bool:
     """Tell whether the parameters of pairs are hardly draws from the prior."""
     return probability_of_prior is not None and probability_of_prior < IMPROBABLE
 
 
 def _learn(
-    theta_cal: Tensor, theta: Tensor, weights: Tensor | None, is_continuous: list[bool]
-) -> ParameterDistribution:
+    theta_cal: Tensor, theta: Tensor, weights: Tensor | None, is_continuous: Tensor
+) -> tuple[float, Tensor]:
+    """Return the probability of the prior, and those of simulations without it."""
     # People who differ in a discrete parameter only are different people.
     theta_cal, place = theta_cal.unique(dim=0, return_inverse=True)
     counts = torch.ones(len(theta_cal), dtype=torch.double, device=theta_cal.device)
@@ -153,18 +136,12 @@ def _learn(
     probability = float(torch.sigmoid(counts @ normal.log_prob(u_cal) - average))
     predictive = torch.stack([log_t for _, log_t in fits], dim=1)
     log_t = (predictive + evidence.log_softmax(dim=0)).logsumexp(dim=1)
-    ratio = torch.softmax(log_t - normal.log_prob(u), dim=0)
-    uniform = torch.full_like(ratio, 1.0 / len(ratio))
-    return ParameterDistribution(
-        probabilities=probability * uniform + (1.0 - probability) * ratio,
-        probability_of_prior=probability,
-    )
+    return probability, torch.softmax(log_t - normal.log_prob(u), dim=0)
 
 
 def normal_scores(theta: Tensor, reference: Tensor) -> Tensor:
-    """Map each parameter to the normal quantile of its rank in a reference sample.
+    """Map parameters ``(m, d)`` to normal quantiles of their ranks among a reference.
 
-    Parameters ``(m, d)`` and draws from the prior ``(n, d)`` to float64 ``(m, d)``.
     Equal values get the middle of their ranks.
     """
     ordered = reference.double().T.contiguous().sort(dim=1).values
@@ -179,12 +156,12 @@ def _fit(
     u_cal: Tensor, u: Tensor, counts: Tensor, correlation: Tensor, strength: float
 ) -> tuple[Tensor, Tensor]:
     """Return the log evidence at one strength, and the log predictive density at u."""
+    # These are the conjugate formulas for a normal distribution with unknown mean and
+    # covariance.
     n, d = float(counts.sum()), u_cal.shape[1]
     degrees, scale = strength + d + 1, strength * correlation
     average = counts @ u_cal / n
     centred = u_cal - average
-    # These are the conjugate formulas for a normal distribution with unknown mean and
-    # covariance.
     total = strength + n
     new_degrees = degrees + n
     new_scale = scale + centred.T @ (counts[:, None] * centred)

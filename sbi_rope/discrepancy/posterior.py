@@ -10,42 +10,48 @@ from torch.distributions import Chi2
 from sbi_rope._random import seeded
 from sbi_rope.tensors import as_batch
 
-__all__ = ["Discrepancy", "DiscrepancyDraws", "Term", "noise_scale"]
+__all__ = [
+    "SMALLEST_ERROR",
+    "Discrepancy",
+    "DiscrepancyDraws",
+    "Term",
+    "noise_scale",
+    "rounding",
+]
 
 # Entries of the matrices that simulations are corrected by at a time.
 MAX_ENTRIES = 2**22
 # The smallest noise of an entry, relative to the largest, that is told apart from none.
 SMALLEST_SCALE = 0.01
+# The smallest standard deviations of noise and error, in those of simulations from the
+# prior, times D. Some statistics have no noise. x can be more precise than h(x).
+SMALLEST_NOISE = 0.01
+SMALLEST_ERROR = {"embedding": 0.01, "tuned": 0.01, "input": 0.003}
 
 
 def noise_scale(covariance: Tensor) -> Tensor:
-    """Return the diagonal of D: the noise of each entry, relative to the largest.
+    """Return the diagonal of D, the noise of each entry relative to the largest.
 
-    The covariance is that of simulations at one parameter, ``(*batch, l, l)``. D is
-    one if there is no noise at all.
+    The covariance is that of simulations at one parameter, ``(*batch, l, l)``.
     """
     std = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
     largest = std.amax(dim=-1, keepdim=True)
     return torch.where(largest > 0, std / largest, 1.0).clamp_min(SMALLEST_SCALE)
 
 
+def rounding(covariance: Tensor) -> Tensor:
+    """Return the smallest variance of the noise of each entry, ``(*batch, l)``."""
+    return (SMALLEST_NOISE * noise_scale(covariance)).square()
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Term:
-    r"""The posterior at one setting of the hyper-parameters, or a batch of these.
+    """The posterior at one setting of the hyper-parameters, or a batch of these."""
 
-    Attributes:
-        coefficients: Mean of :math:`(A, b)^\top`, shape ``(*batch, l + 1, l)``.
-        row_factor: Lower Cholesky factor of the covariance of its rows, shape
-            ``(*batch, l + 1, l + 1)``.
-        error_factor: L, with :math:`L L^\top` the scale of the inverse Wishart
-            distribution of :math:`\Sigma`, shape ``(*batch, l, l)``.
-        degrees: Its degrees of freedom, shape ``batch``.
-    """
-
-    coefficients: Tensor
-    row_factor: Tensor
-    error_factor: Tensor
-    degrees: Tensor
+    coefficients: Tensor  # the mean of (A, b)', (*batch, l + 1, l)
+    row_factor: Tensor  # of the covariance of its rows, (*batch, l + 1, l + 1)
+    error_factor: Tensor  # of the scale of Sigma (inverse Wishart), (*batch, l, l)
+    degrees: Tensor  # of freedom of Sigma, batch
 
     def sample(self, count: int) -> tuple[Tensor, Tensor, Tensor]:
         r"""Draw :math:`A`, :math:`b` and :math:`\Sigma`, ``count`` of each term."""
@@ -70,17 +76,16 @@ class Discrepancy:
     """The posterior of gain, offset and error, averaged over the hyper-parameters.
 
     Attributes:
-        terms: The posterior at each setting of the hyper-parameters whose evidence is
-            not negligible.
+        terms: The posterior at each setting whose evidence is not negligible.
         shares: The shares of the terms in the evidence, which sum to one.
         noise: The covariance C of simulations at one parameter, shape ``(l, l)``.
         probability_of_none: The probability that the simulator is right.
-        log_evidence: Log density of the pairs under a discrepancy, to the power that
-            each group counts as one pair.
+        log_evidence: Log density of the pairs under a discrepancy, where each group
+            counts as one pair.
         log_evidence_of_none: The same if the simulator is right.
         num_pairs: The number of calibration pairs.
         num_independent: How many independent pairs these count as: the sum of their
-            weights, less if pairs of the same group have errors in common.
+            weights, or less if pairs of a group have errors in common.
     """
 
     terms: tuple[Term, ...] = field(repr=False)
@@ -94,24 +99,18 @@ class Discrepancy:
 
     @torch.no_grad()
     def sample(
-        self,
-        num_draws: int,
-        *,
-        smallest_error: float = 0.01,
-        seed: int | None = None,
+        self, num_draws: int, *, smallest_error: float = 0.01, seed: int | None = None
     ) -> "DiscrepancyDraws":
         r"""Draw gains, offsets and errors.
 
-        A share ``probability_of_none`` of the draws has gain one, offset zero and no
-        error. In the other draws the error is :math:`\Sigma` without the simulator's
-        own noise, :math:`\Sigma' = \Sigma - A C A^\top`. The eigenvalues of
-        :math:`D^{-1} \Sigma' D^{-1}` are at least ``smallest_error`` squared, with the
-        noise D of :class:`DiscrepancyModel`.
+        A share ``probability_of_none`` of the draws corrects nothing. In the others the
+        error is without the simulator's own noise,
+        :math:`\Sigma' = \Sigma - A C A^\top`.
 
         Args:
             num_draws: Number of draws.
-            smallest_error: Smallest standard deviation of the error of the entry with
-                most noise, in standard deviations of simulations.
+            smallest_error: The least root of the eigenvalues of
+                :math:`D^{-1} \Sigma' D^{-1}`, see :class:`DiscrepancyModel`.
             seed: Seed of the draws; None uses torch's state.
         """
         none = self.probability_of_none
@@ -124,11 +123,11 @@ class Discrepancy:
                 for term, count in zip(self.terms, counts, strict=True)
                 if count
             ]
-        width = len(self.noise)
+        no_error = self.noise.new_zeros(num_none, *self.noise.shape)
         no_correction = DiscrepancyDraws(
-            gain=torch.eye(width).to(self.noise).expand(num_none, -1, -1),
-            offset=self.noise.new_zeros(num_none, width),
-            error_factor=self.noise.new_zeros(num_none, width, width),
+            gain=no_error + torch.eye(len(self.noise)).to(no_error),
+            offset=no_error[:, 0],
+            error_factor=no_error,
         )
         return DiscrepancyDraws.joined([*parts, no_correction])
 
@@ -169,10 +168,7 @@ class DiscrepancyDraws:
         return len(self.offset)
 
     def correct(self, z_s: Tensor, draw: Tensor | None = None) -> Tensor:
-        """Return simulations as they would be observed in reality.
-
-        Each simulation is corrected by a draw that is chosen at random, and gets an
-        error of its own. Together they represent the whole posterior.
+        """Return simulations as they would be observed in reality, with own errors.
 
         Args:
             z_s: Simulations, shape ``(n, l)``.

@@ -9,52 +9,25 @@ import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from sbi_rope.discrepancy.posterior import Discrepancy, Term, noise_scale
+from sbi_rope.discrepancy.posterior import Discrepancy, Term, noise_scale, rounding
 
-__all__ = [
-    "SMALLEST_NOISE",
-    "Conditional",
-    "GroupErrors",
-    "Regressions",
-    "independent_pairs",
-    "log_density_of_right",
-]
+__all__ = ["Conditional", "GroupErrors", "Regressions", "independent_pairs"]
 
 # The prior precision of the offset is this share of the precision of the gain.
 OFFSET_PRECISION = 1 / 3
 # The prior precision of the gain is at least this times the noise C of each entry and
-# the number of entries. What is uncertain about the gain then adds a quarter of the
-# error to the noise, at most and on average. Without this, the noise of imprecise
-# entries leaks into a precise one, along directions in which the means of the pairs do
-# not vary.
+# the number of entries. Otherwise, the noise of imprecise entries leaks into a precise
+# one, along directions in which the means of the pairs do not vary.
 LEAST_PRECISION = 4.0
-# This standard deviation, times D, is added to the noise of simulations at one
-# parameter, because some statistics have no noise at all. Its unit is the standard
-# deviation of simulations from the prior.
-SMALLEST_NOISE = 0.01
-# Settings of the hyper-parameters are left out if their evidence is less than this
-# share of the evidence of the best setting.
+# Settings with less than this share of the evidence of the best one are left out.
 NEGLIGIBLE = 1e-4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class GroupErrors:
-    r"""Errors of calibration pairs that are correlated within groups.
+    r"""Errors :math:`E \sim \mathcal{MN}(0, R, \Sigma)`, correlated within groups."""
 
-    The errors E of n pairs have the matrix normal distribution
-
-    .. math::
-        E \sim \mathcal{MN}(0, R, \Sigma), \qquad
-        R_{ij} = \begin{cases} 1 & \text{if } i = j, \\
-        \rho & \text{if } i \neq j \text{ are of the same group}, \\
-        0 & \text{otherwise}. \end{cases}
-
-    Attributes:
-        groups: Numbers of the groups from 0 on, shape ``(n,)``.
-        correlation: :math:`\rho`, at least 0 and less than 1.
-    """
-
-    groups: Tensor
+    groups: Tensor  # the number of the group of each pair, from 0 on, (n,)
     correlation: float
 
     def independent(self, values: Tensor) -> Tensor:
@@ -79,13 +52,9 @@ class GroupErrors:
 def independent_pairs(
     groups: Tensor, correlation: float | Tensor, weights: Tensor
 ) -> Tensor:
-    r"""Return how many independent pairs each counts as (Kish), ``(*batch, n)``.
-
-    A pair among k of its group counts as :math:`1 / (1 + (k - 1) \rho)`. If the weights
-    of a group differ, k is its effective number of pairs: the squared sum of its
-    weights over the sum of their squares. Groups are numbered from 0 on.
-    """
+    """Return how many independent pairs each counts as (Kish), ``(*batch, n)``."""
     w = weights.double()
+    # The effective number of pairs of each group, if their weights differ.
     number = groups.bincount(weights=w).square() / groups.bincount(weights=w.square())
     correlation = torch.as_tensor(correlation).to(w)[..., None]
     return w / (1 + (number[groups] - 1) * correlation)
@@ -93,31 +62,22 @@ def independent_pairs(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Regressions:
-    r"""Real observations regressed on simulated means, at K forms of the prior.
+    """Real observations regressed on B sets of simulated means, at K forms of prior.
 
     A form is a precision of the gain, and a shape of the error: the identity or D.
-    There are B sets of means, such as imputed ones. Each has its own regressions.
-
-    Attributes:
-        coefficients: Means of :math:`(A, b)^\top`, shape ``(B, K, l + 1, l)``.
-        row_factor: Lower Cholesky factors of the covariances of their rows, shape
-            ``(B, K, l + 1, l + 1)``.
-        shapes: The diagonals of the shapes, ``(K, l)``.
-        variances: Eigenvalues of the scatter matrices of the residuals, which are
-            divided by the shape, ``(B, K, l)``.
-        directions: Their eigenvectors, shape ``(B, K, l, l)``.
-        log_volume: The parts of the log evidences that come from the coefficients, from
-            the shape, and from the correlation of the errors, shape ``(B, K)``.
-        num_pairs: The sum of the weights of the pairs, shape ``(B,)``.
     """
 
-    coefficients: Tensor
-    row_factor: Tensor
-    shapes: Tensor
+    coefficients: Tensor  # means of (A, b)', (B, K, l + 1, l)
+    row_factor: Tensor  # of the covariances of their rows, (B, K, l + 1, l + 1)
+    shapes: Tensor  # the diagonals of the shapes, (K, l)
+    # Eigenvalues and vectors of the scatter matrices of the residuals in units of the
+    # shape, (B, K, l) and (B, K, l, l).
     variances: Tensor
     directions: Tensor
+    # The parts of the log evidences that come from the coefficients, from the shape,
+    # and from the correlation of the errors, (B, K).
     log_volume: Tensor
-    num_pairs: Tensor
+    num_pairs: Tensor  # the sum of the weights of the pairs, (B,)
 
     @classmethod
     def of(
@@ -132,9 +92,8 @@ class Regressions:
     ) -> "Regressions":
         """Return the conjugate posterior of the coefficients at each form.
 
-        Observations z have the shape ``(n, l)``, means ``(B, n, l)``, and weights
-        ``(n,)`` or ``(B, n)``. They are one if ``errors`` are correlated. ``noise`` is
-        C, the covariance of simulations at one parameter.
+        Means have the shape ``(B, n, l)``, and weights ``(n,)`` or ``(B, n)``. The
+        weights are one if ``errors`` are correlated.
         """
         width = mean.shape[2]
         identity = torch.eye(width).to(z)
@@ -160,20 +119,20 @@ class Regressions:
         # This is a sum of squares. The usual difference of two terms could be negative.
         left_over = residual - design @ shift
         scatter = left_over.mT @ left_over + shift.mT @ (precision[..., None] * shift)
-        # No z is known more precisely than SMALLEST_NOISE, even if pairs agree exactly.
+        # No z is known more precisely than rounded, even if pairs agree exactly.
         # Pairs are rounded one by one, whatever the errors of a group have in common.
-        scale = noise_scale(noise)
-        scatter = scatter + num_rounded * (SMALLEST_NOISE * scale).square().diag()
+        scatter = scatter + num_rounded * rounding(noise).diag()
         log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(dim=-1)
         log_volume = width / 2 * (precision.log().sum(1) - log_det - log_det_errors)
         # From here on both shapes follow each other in the dimension of the precisions.
+        scale = noise_scale(noise)
         shapes = torch.stack([torch.ones_like(scale), scale]).unique(dim=0)
         several, count = len(shapes), len(precision)
-        log_volume = log_volume.repeat(1, several)
         shapes = shapes.repeat_interleave(count, dim=0)
         scatter = scatter.repeat(1, several, 1, 1) / shapes[:, None] / shapes[..., None]
         variances, directions = torch.linalg.eigh(scatter)
         row_factor = torch.linalg.cholesky(torch.cholesky_inverse(factor))
+        log_volume = log_volume.repeat(1, several)
         return cls(
             coefficients=(prior_mean + shift).repeat(1, several, 1, 1),
             row_factor=row_factor.repeat(1, several, 1, 1),
@@ -185,11 +144,7 @@ class Regressions:
         )
 
     def log_evidence(self, settings: Sequence[tuple[float, float]]) -> Tensor:
-        """Return the log density of the pairs at each form and setting.
-
-        The settings are S pairs of an error scale and its strength, so that the shape
-        is ``(B, K, S)``.
-        """
+        """Return the log density of the pairs at forms and settings, ``(B, K, S)``."""
         n, width = self.num_pairs[:, None, None], self.variances.shape[-1]
         error_scale, strength = self.variances.new_tensor(settings).unbind(dim=1)
         scale = strength * error_scale.square()
@@ -204,48 +159,32 @@ class Regressions:
             - torch.special.multigammaln(degrees / 2, width)
         )
 
-    def at(self, where: tuple[Any, Any], error_scale: Any, strength: Any) -> Term:
-        """Return the posterior at a set and form, an error scale and a strength.
-
-        All arguments are numbers, or tensors of shape ``(m,)`` for m terms in one.
-        """
-        like = self.variances
-        strength = torch.as_tensor(strength).to(like)
-        smallest = strength * torch.as_tensor(error_scale).to(like).square()
-        scale = like[where] + smallest[..., None]
+    def at(self, where: tuple[Any, Any], setting: Any) -> Term:
+        """Return the posterior at one set, form and setting, or at m, ``(m,)``."""
+        error_scale, strength = (torch.as_tensor(s).to(self.variances) for s in setting)
+        scale = self.variances[where] + (strength * error_scale.square())[..., None]
+        error_factor = self.directions[where] * scale[..., None, :].sqrt()
         return Term(
             coefficients=self.coefficients[where],
             row_factor=self.row_factor[where],
-            error_factor=self.shapes[where[1]][..., None]
-            * self.directions[where]
-            * scale[..., None, :].sqrt(),
+            error_factor=self.shapes[where[1]][..., None] * error_factor,
             degrees=strength + scale.shape[-1] + 1 + self.num_pairs[where[0]],
         )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Conditional:
-    """The posterior of the discrepancy given each of B sets of means.
+    """The posterior of the discrepancy given each of B sets of means."""
 
-    Attributes:
-        regressions: The posteriors at K forms of the prior.
-        log_evidence: At these and S further settings, shape ``(B, K, S)``.
-        settings: The error scales and strengths, S of each.
-        noise: The covariance C of simulations at one parameter, shape ``(l, l)``.
-        average: Log density of the pairs under a discrepancy, with each group as one
-            pair, shape ``(B,)``.
-        right: The same if the simulator is right, shape ``(B,)``.
-        probability_of_none: That the simulator is right, shape ``(B,)``.
-        num_pairs: The number of calibration pairs.
-    """
-
-    regressions: Regressions
-    log_evidence: Tensor
-    settings: Sequence[tuple[float, float]]
-    noise: Tensor
+    regressions: Regressions  # at K forms of the prior
+    log_evidence: Tensor  # at these and S further settings, (B, K, S)
+    settings: Sequence[tuple[float, float]]  # error scales and their strengths
+    noise: Tensor  # C, the covariance of simulations at one parameter, (l, l)
+    # Log densities of the pairs under a discrepancy and if the simulator is right, with
+    # each group as one pair, (B,).
     average: Tensor
     right: Tensor
-    probability_of_none: Tensor
+    probability_of_none: Tensor  # (B,)
     num_pairs: int
 
     def posteriors(self) -> list[Discrepancy]:
@@ -256,7 +195,7 @@ class Conditional:
         kept = evidence > evidence.max() + math.log(NEGLIGIBLE)
         return Discrepancy(
             terms=tuple(
-                self.regressions.at((number, k), *self.settings[s])
+                self.regressions.at((number, k), self.settings[s])
                 for k, s in kept.nonzero().tolist()
             ),
             shares=torch.softmax(evidence[kept], dim=0),
@@ -269,18 +208,13 @@ class Conditional:
         )
 
     def draw(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Draw a gain, an offset and the covariance of observations at one parameter.
-
-        One of each is drawn from each of :meth:`posteriors`, without computing them,
-        and with the settings that they leave out. Their shapes are ``(B, l, l)``,
-        ``(B, l)`` and ``(B, l, l)``.
-        """
+        """Draw a gain, an offset and the covariance of z given theta for each set."""
         probabilities = torch.softmax(self.log_evidence.flatten(1), dim=1)
         chosen = torch.multinomial(probabilities, 1)[:, 0]
         k, s = chosen // len(self.settings), chosen % len(self.settings)
-        scale, strength = self.noise.new_tensor(self.settings)[s].unbind(dim=1)
+        setting = self.noise.new_tensor(self.settings)[s].unbind(dim=1)
         which = torch.arange(len(chosen), device=chosen.device)
-        drawn = self.regressions.at((which, k), scale, strength).sample(1)
+        drawn = self.regressions.at((which, k), setting).sample(1)
         gain, offset, covariance = (values[0] for values in drawn)
         none = torch.rand(len(chosen)).to(gain) < self.probability_of_none
         identity = torch.eye(len(self.noise)).to(gain)
@@ -294,6 +228,5 @@ class Conditional:
 def log_density_of_right(residual: Tensor, noise: Tensor, weights: Tensor) -> Tensor:
     """Return the log density of z - m, ``(B,)``, rounded as ``Regressions`` do."""
     log_density = MultivariateNormal(torch.zeros_like(noise[0]), noise).log_prob
-    rounded = (SMALLEST_NOISE * noise_scale(noise)).square()
-    inexact = weights.sum() * (rounded * torch.linalg.inv(noise).diagonal()).sum()
-    return (weights * log_density(residual)).sum(dim=1) - inexact / 2
+    inexact = weights.sum() * (rounding(noise) * torch.linalg.inv(noise).diagonal())
+    return (weights * log_density(residual)).sum(dim=1) - inexact.sum() / 2

@@ -15,14 +15,7 @@ from sbi_rope.discrepancy.posterior import Discrepancy
 from sbi_rope.errors import InvalidInputError
 from sbi_rope.simulate import Moments
 
-__all__ = [
-    "DiscrepancyReport",
-    "Interval",
-    "SummaryDiscrepancy",
-    "report_discrepancy",
-    "what_groups_count_as",
-    "what_outliers_mean",
-]
+__all__ = ["DiscrepancyReport", "Interval", "SummaryDiscrepancy", "report_discrepancy"]
 
 NUM_DRAWS = 4000
 # A progress bar appears after this many seconds.
@@ -35,6 +28,8 @@ EFFICIENCY = 0.37
 MIN_PAIRS_FOR_OUTLIERS = 10
 # If this share of the pairs are outliers, they are hardly all mistakes of labelling.
 MANY_OUTLIERS = 0.05
+# What is estimated with an interval.
+ESTIMATES = ("size", "shift", "gain", "error")
 
 
 @dataclass(frozen=True)
@@ -70,15 +65,13 @@ class SummaryDiscrepancy:
         shift: b, in the units of x.
         error: s, in the units of x. It comes in addition to the simulator's noise.
         size: Typical difference between a simulation and its correction, the root of
-            :math:`E[(b + (a - 1)(x_s - \bar x))^2] + s^2`, in standard deviations of
-            simulations from the prior.
+            :math:`E[(b + (a - 1)(x_s - \bar x))^2] + s^2`, in units of ``std``.
         probability_of_none: The probability that the simulator is right about this
             summary, with one half before any pair is seen.
         outliers: Rows of calibration pairs that do not fit the others. In 99 of 100
             summaries without outliers no pair is so far away by chance.
         std: The standard deviation of simulations from the prior, in the units of x.
-        num_independent: How many independent pairs the calibration pairs count as here,
-            see :class:`~sbi_rope.discrepancy.DiscrepancyModel`.
+        num_independent: How many independent pairs the calibration pairs count as here.
     """
 
     name: str
@@ -108,8 +101,7 @@ class DiscrepancyReport:
             Summaries without a sign of discrepancy are last.
         num_pairs: The number of calibration pairs.
         num_groups: The number of people or specimens that they are of.
-        constant: The names of summaries that are the same in all simulations. Nothing
-            can be said about them.
+        constant: The names of summaries that are the same in all simulations.
     """
 
     summaries: tuple[SummaryDiscrepancy, ...]
@@ -129,31 +121,59 @@ class DiscrepancyReport:
                 f"Expected `x_names` to be {len(known)} different names, of "
                 f"{sorted(known)}; got {list(names)}."
             )
-        summaries = tuple(replace(s, name=of_entry[s.name]) for s in self.summaries)
-        constant = tuple(of_entry[name] for name in self.constant)
-        return replace(self, summaries=summaries, constant=constant)
+        return replace(
+            self,
+            summaries=tuple(replace(s, name=of_entry[s.name]) for s in self.summaries),
+            constant=tuple(of_entry[name] for name in self.constant),
+        )
 
     def as_rows(self) -> list[dict[str, Any]]:
         """Return a row for each summary, in the order of ``summaries``."""
         rows = []
         for summary in self.summaries:
             row: dict[str, Any] = {"summary": summary.name}
-            for name in ("size", "shift", "gain", "error"):
-                interval: Interval = getattr(summary, name)
-                row |= {
-                    name: interval.median,
-                    f"{name}_low": interval.low,
-                    f"{name}_high": interval.high,
-                }
+            for name in ESTIMATES:
+                ends: Interval = getattr(summary, name)
+                row |= {name: ends.median, f"{name}_low": ends.low}
+                row[f"{name}_high"] = ends.high
             row["probability_of_none"] = summary.probability_of_none
             row["outliers"] = list(summary.outliers)
-            row["num_independent"] = summary.num_independent
-            rows.append(row)
+            rows.append(row | {"num_independent": summary.num_independent})
         return rows
 
+    @property
+    def notes(self) -> list[str]:
+        """Sentences about constant summaries, groups of pairs, and outliers."""
+        notes = []
+        if self.constant:
+            notes.append(f"The same in all simulations: {', '.join(self.constant)}.")
+        if self.num_groups < self.num_pairs:
+            numbers = {round(summary.num_independent) for summary in self.summaries}
+            count = " to ".join(map(str, sorted({min(numbers), max(numbers)})))
+            notes.append(
+                "Pairs of a group can have errors in common. Here, the "
+                f"{self.num_pairs} pairs count as {count} independent ones."
+            )
+        outliers: dict[int, list[str]] = {}
+        for summary in self.summaries:
+            for row in summary.outliers:
+                outliers.setdefault(row, []).append(summary.name)
+        if outliers:
+            listed = [f"row {row} ({', '.join(n)})" for row, n in outliers.items()]
+            meaning = (
+                "Look whether a label or a measurement is wrong, or whether reality is "
+                "not linear in the simulation there."
+            )
+            if len(outliers) > max(2.0, MANY_OUTLIERS * self.num_pairs):
+                meaning = (
+                    "So many suggest that reality is not linear in the simulation "
+                    "there, rather than that labels are wrong."
+                )
+            pairs = f"Pairs that do not fit the others: {'; '.join(listed)}. {meaning}"
+            notes.append(pairs)
+        return notes
+
     def __str__(self) -> str:
-        off = [summary for summary in self.summaries if summary.is_off]
-        fine = [summary.name for summary in self.summaries if not summary.is_off]
         grouped = self.num_groups < self.num_pairs
         in_groups = f" in {self.num_groups} groups" if grouped else ""
         lines = [
@@ -161,68 +181,23 @@ class DiscrepancyReport:
             "simulator",
             "  observed = mean + shift + gain (simulated - mean) + error",
         ]
-        if off:
+        rows = [("summary", *ESTIMATES)] + [
+            (s.name, *(str(getattr(s, name)) for name in ESTIMATES))
+            for s in self.summaries
+            if s.is_off
+        ]
+        if len(rows) > 1:
             lines.append(
                 "  95 % intervals; size in standard deviations of simulations, shift "
                 "and error in units of x"
             )
-            lines += _table(off)
-        if fine:
+            widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+            lines += [
+                "  " + "  ".join(map(str.ljust, row, widths)).rstrip() for row in rows
+            ]
+        if fine := [summary.name for summary in self.summaries if not summary.is_off]:
             lines.append(f"  no sign of discrepancy: {', '.join(fine)}")
-        if self.constant:
-            lines.append(f"  the same in all simulations: {', '.join(self.constant)}")
-        if counted := what_groups_count_as(self):
-            lines.append(f"  {counted}")
-        outliers: dict[int, list[str]] = {}
-        for summary in self.summaries:
-            for row in summary.outliers:
-                outliers.setdefault(row, []).append(summary.name)
-        if outliers:
-            listed = (f"row {row} ({', '.join(n)})" for row, n in outliers.items())
-            lines.append(
-                f"  pairs that do not fit the others: {'; '.join(listed)}. "
-                f"{what_outliers_mean(len(outliers), self.num_pairs)}"
-            )
-        return "\n".join(lines)
-
-
-def what_groups_count_as(report: DiscrepancyReport) -> str:
-    """Say how many independent pairs those of a report count as; "" without groups."""
-    if report.num_groups == report.num_pairs:
-        return ""
-    numbers = [summary.num_independent for summary in report.summaries]
-    least, most = f"{min(numbers):.0f}", f"{max(numbers):.0f}"
-    count = least if least == most else f"{least} to {most}"
-    return (
-        "Pairs of a group can have errors in common. Here, the "
-        f"{report.num_pairs} pairs count as {count} independent ones."
-    )
-
-
-def what_outliers_mean(count: int, num_pairs: int) -> str:
-    """Say what pairs that do not fit the others may be a sign of."""
-    if count > max(2.0, MANY_OUTLIERS * num_pairs):
-        return (
-            "So many suggest that reality is not linear in the simulation there, "
-            "rather than that labels are wrong."
-        )
-    return (
-        "Look whether a label or a measurement is wrong, or whether reality is not "
-        "linear in the simulation there."
-    )
-
-
-def _table(summaries: Sequence[SummaryDiscrepancy]) -> list[str]:
-    heads = ("summary", "size", "shift", "gain", "error")
-    rows = [heads] + [
-        (s.name, str(s.size), str(s.shift), str(s.gain), str(s.error))
-        for s in summaries
-    ]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(heads))]
-    return [
-        "  " + "  ".join(f"{c:<{w}}" for c, w in zip(row, widths, strict=True)).rstrip()
-        for row in rows
-    ]
+        return "\n".join([*lines, *(f"  {note}" for note in self.notes)])
 
 
 def report_discrepancy(
@@ -235,41 +210,37 @@ def report_discrepancy(
     groups: Tensor | None = None,
     show_progress_bars: bool = False,
 ) -> DiscrepancyReport:
-    """Fit the discrepancy of each summary separately.
+    """Fit the discrepancy of each summary of x ``(n, l)`` separately.
 
     A joint gain of summaries that depend on each other, such as two sensors of one
     light, is ambiguous. The gain of a single summary is not, and can be checked.
-
-    Observations x have the shape ``(n, l)``, and simulations from the prior
-    ``(n_s, l)``. Weights and groups are those of :meth:`DiscrepancyModel.fit`.
     """
-    names = [f"x[{j}]" for j in range(x.shape[1])]
-    standardisation = Standardisation(simulated.double())
-    varies = standardisation.varies.tolist()
-    summaries = []
+    unit = Standardisation(simulated.double())
+    is_constant = (~unit.varies).tolist()
+    summaries, constant = [], []
     for j in progress_bar(
-        range(len(names)), show=show_progress_bars, desc="Summaries", delay=DELAY
+        range(x.shape[1]), show=show_progress_bars, desc="Summaries", delay=DELAY
     ):
-        if not varies[j]:
+        if is_constant[j]:
+            constant.append(f"x[{j}]")
             continue
-        mean, std = standardisation.mean[j], standardisation.std[j]
+        mean, std = unit.mean[j], unit.std[j]
         z = ((x[:, j].double() - mean) / std)[:, None]
         m = ((moments.means[..., j] - mean) / std)[..., None]
         noise = moments.covariance[:, j, j].mean() / std.square()
         found = model.fit(z, m, noise.reshape(1, 1), weights=weights, groups=groups)
-        summaries.append(_summary(names[j], found, z, m, scale=float(std)))
+        summaries.append(_summary(f"x[{j}]", found, z, m, scale=float(std)))
     if not summaries:
         raise InvalidInputError(
             "Expected simulations that differ from each other; all summaries are "
             "constant."
         )
+    summaries.sort(key=lambda s: (not s.is_off, -s.size.median))
     return DiscrepancyReport(
-        summaries=tuple(
-            sorted(summaries, key=lambda s: (not s.is_off, -s.size.median))
-        ),
+        summaries=tuple(summaries),
         num_pairs=len(x),
         num_groups=len(x) if groups is None else len(groups.unique()),
-        constant=tuple(n for n, v in zip(names, varies, strict=True) if not v),
+        constant=tuple(constant),
     )
 
 
@@ -311,17 +282,10 @@ def _outliers(residual: Tensor, noise: float) -> tuple[int, ...]:
     # The median distance of a normal variable from its median is 0.6745 standard
     # deviations.
     std = (distance.median() / 0.6745).clamp_min(noise)
-    return tuple((distance > _furthest(n) * std).nonzero().flatten().tolist())
-
-
-def _furthest(n: int) -> float:
-    """Return the distance that the furthest of n values exceeds with 1 % probability.
-
-    The unit is the standard deviation. Because this is an estimate, the distribution is
-    a Student t and not a normal one. Its quantile is computed by Wallace's
-    approximation.
-    """
+    # The furthest of n values exceeds this quantile with a probability of 1 %. The
+    # standard deviation is an estimate, hence Student's t, by Wallace's approximation.
     level = torch.tensor(1 - FALSE_ALARMS / (2 * n), dtype=torch.double)
     freedom = EFFICIENCY * (n - 1)
     score = float(torch.special.ndtri(level)) * (8 * freedom + 3) / (8 * freedom + 1)
-    return math.sqrt(freedom * math.expm1(score**2 / freedom))
+    furthest = math.sqrt(freedom * math.expm1(score**2 / freedom))
+    return tuple((distance > furthest * std).nonzero().flatten().tolist())

@@ -9,7 +9,11 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope._random import seeded
-from sbi_rope.discrepancy.posterior import DiscrepancyDraws, noise_scale
+from sbi_rope.discrepancy.posterior import (
+    SMALLEST_ERROR,
+    DiscrepancyDraws,
+    noise_scale,
+)
 from sbi_rope.errors import warn_user
 from sbi_rope.fit import Training, fit
 from sbi_rope.simulate import Moments
@@ -19,11 +23,8 @@ __all__ = ["LaplaceDiscrepancy", "Marginal", "fit_unlabelled"]
 # Gaussians that the marginal density of simulations mixes, fitted to so many.
 NUM_COMPONENTS, NUM_FITTED = 25, 8000
 # Prior standard deviations of the offset, and of the diagonal and the other entries of
-# the gain. Centre of the standard deviations of the error, whose logarithms have the
-# standard deviation one.
+# the gain. Centre of those of the error, whose logarithms have standard deviation one.
 OFFSET, DIAGONAL, OFF_DIAGONAL, ERROR = 0.3, 0.3, 0.1, 0.3
-# The smallest standard deviation of the error, as for a discrepancy of x.
-SMALLEST_ERROR = 0.003
 # The search for the mode, and how far below it the result may be, in nats.
 SEARCH = Training(learning_rate=3e-2, max_num_epochs=200)
 TOLERANCE = 0.1
@@ -51,19 +52,12 @@ class Marginal(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LaplaceDiscrepancy:
-    """A normal approximation of the posterior of gain, offset and error.
+    """A normal approximation of the posterior of gain, offset and error."""
 
-    Attributes:
-        mode: The mode, in standard deviations of the prior, shape ``(P,)``.
-        root: A root of the covariance, shape ``(P, P)``.
-        scale: The diagonal of D, see :class:`DiscrepancyModel`, shape ``(l,)``.
-        below: How far the log posterior at ``mode`` is below its maximum, in nats.
-    """
-
-    mode: Tensor
-    root: Tensor
-    scale: Tensor
-    below: float
+    mode: Tensor  # in standard deviations of the prior, (P,)
+    root: Tensor  # of the covariance, (P, P)
+    scale: Tensor  # the diagonal of D, see DiscrepancyModel, (l,)
+    below: float  # how far the log posterior is below its maximum, in nats
 
     def sample(
         self, num_draws: int, *, smallest_error: float, seed: int | None = None
@@ -71,9 +65,8 @@ class LaplaceDiscrepancy:
         """Draw gains, offsets and errors, see :meth:`Discrepancy.sample`."""
         with seeded(seed):
             normal = torch.randn(num_draws, len(self.mode)).to(self.mode)
-        gain, offset, factor = _unpacked(
-            self.mode + normal @ self.root.T, len(self.scale)
-        )
+        values = self.mode + normal @ self.root.T
+        gain, offset, factor = _unpacked(values, len(self.scale))
         smallest = (smallest_error * self.scale).square().diag()
         factor = torch.linalg.cholesky(factor @ factor.mT + smallest)
         return DiscrepancyDraws(gain=gain, offset=offset, error_factor=factor)
@@ -100,18 +93,7 @@ def fit_unlabelled(
     This is right only where the parameters of the observations follow the prior. The
     mode is searched from that of the labels alone, and its Hessian gives the covariance
     (Laplace's approximation). All quantities are in standard deviations of simulations.
-
-    Args:
-        z: The real observations of the pairs, shape ``(n, l)``.
-        moments: Those of simulations at the exact labels of the pairs.
-        weights: How many pairs each counts as in each of E versions, ``(E, n)``. Those
-            of weight zero are not seen.
-        z_o: Observations without labels, shape ``(n_o, l)``.
-        marginal: The mixture.
-        show_progress_bars: Whether to show the search.
-
-    Returns:
-        One for each version.
+    Each of E versions has weights, ``(E, n)``, and does not see those of weight zero.
     """
     z_o, width, count = z_o.double(), z.shape[1], len(weights)
     seen = (weights > 0)[..., None]
@@ -122,7 +104,7 @@ def fit_unlabelled(
     )
     share = (weights / weights.sum(dim=1, keepdim=True))[..., None, None]
     scale = noise_scale((share * covariance).sum(dim=1))
-    smallest = torch.diag_embed((SMALLEST_ERROR * scale).square())
+    smallest = torch.diag_embed((SMALLEST_ERROR["input"] * scale).square())
 
     def loss(at: Tensor, *, unlabelled: bool = True) -> Tensor:
         gain, offset, factor = _unpacked(at, width)
@@ -138,7 +120,8 @@ def fit_unlabelled(
             log_p = log_p + of_each.logsumexp(dim=1).sum(dim=1)
         return at.square().sum(dim=1) / 2 - log_p
 
-    modes = _Modes(torch.zeros(count, _num_entries(width)).to(z))
+    num_entries = width**2 + width + width * (width + 1) // 2
+    modes = _Modes(torch.zeros(count, num_entries).to(z))
     for unlabelled in (False, True):
         fit(
             modes,
@@ -175,8 +158,7 @@ def _polished(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the modes, roots of the covariances, and how far below the modes we are.
 
-    The Hessians are differences of gradients. They serve several steps of Newton's
-    method.
+    Each Hessian, of differences of gradients, serves several steps of Newton's method.
     """
 
     def gradient(values: Tensor) -> Tensor:
@@ -206,15 +188,10 @@ def _polished(
     return at, root, white.square().sum(dim=(1, 2)) / 2
 
 
-def _num_entries(width: int) -> int:
-    return width**2 + width + width * (width + 1) // 2
-
-
 def _unpacked(values: Tensor, width: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return gain, offset and a factor of the error, of numbers ``(*batch, P)``."""
-    gain, offset, triangle = values.split(
-        [width**2, width, _num_entries(width) - width**2 - width], dim=-1
-    )
+    sizes = width**2, width, width * (width + 1) // 2
+    gain, offset, triangle = values.split(sizes, dim=-1)
     one = torch.eye(width).to(values)
     std = OFF_DIAGONAL + (DIAGONAL - OFF_DIAGONAL) * one
     gain = one + std * gain.unflatten(-1, (width, width))
@@ -222,9 +199,8 @@ def _unpacked(values: Tensor, width: int) -> tuple[Tensor, Tensor, Tensor]:
     entries = torch.where(
         rows == columns, ERROR * triangle.clamp(-8, 8).exp(), 0.3 * ERROR * triangle
     )
-    place = torch.zeros(len(rows), width, width).to(values)
-    place[torch.arange(len(rows)), rows, columns] = 1.0
-    factor = torch.einsum("...k,kij->...ij", entries, place)
+    factor = torch.zeros_like(gain)
+    factor[..., rows, columns] = entries
     return gain, OFFSET * offset, factor
 
 

@@ -6,26 +6,22 @@ type.
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from sbi_rope._sbi import (
-    MixedDensity,
-    NeuralPosterior,
-    embed,
-    has_parameters,
-)
+from sbi_rope._sbi import MixedDensity, NeuralPosterior, embed, has_parameters
 from sbi_rope._standardisation import Standardisation
 from sbi_rope.density import Density, Flow, GaussianProcess, Given, Prior, density_of
 from sbi_rope.discrepancy.correction import (
     Correction,
     SimulatedConstants,
     Space,
+    Version,
     correct_flow,
-    fit_discrepancy,
+    fit_version,
     in_units,
     network_of,
 )
@@ -35,7 +31,7 @@ from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError, warn_u
 from sbi_rope.finetuning import FINETUNING, TUNING, finetune_flow
 from sbi_rope.fit import without_warning_of_few_pairs
 from sbi_rope.rope import RoPE
-from sbi_rope.settings import Settings, check
+from sbi_rope.settings import check
 from sbi_rope.stacking.data import NUM_FOLDS, StackData, key_of
 from sbi_rope.tensors import as_batch, as_numbers
 
@@ -49,7 +45,6 @@ __all__ = [
     "chosen_candidates",
     "default_candidates",
     "left_out",
-    "suitable_candidates",
 ]
 
 
@@ -176,7 +171,12 @@ def as_density(own: Any, data: StackData, name: str) -> Density:
     return own
 
 
-# What the data need for a correction, in words.
+# What a correction is called, and what the data need for it, in words.
+NAMES: dict[Space, str] = {
+    "embedding": "discrepancy",
+    "input": "discrepancy (input)",
+    "tuned": "discrepancy (tuned)",
+}
 NEEDS: dict[Space, str] = {
     "embedding": "",
     "input": "short x without NaN, and an embedding net",
@@ -184,8 +184,28 @@ NEEDS: dict[Space, str] = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class DiscrepancyCandidate(Settings, Candidate):
+class CorrectingCandidate(Candidate):
+    """A candidate that corrects simulations; ``space`` says what, None nothing."""
+
+    space: Space | None
+
+    def suits(self, data: StackData) -> bool:
+        """Tell whether x is a short vector, or else there are folds enough to tune."""
+        # A short vector is corrected as it is, so that tuned nets add nothing.
+        if self.space == "tuned":
+            return not data.reads_summaries and len(data.folds) > 2
+        return self.space != "input" or data.reads_summaries
+
+    def check(self, data: StackData) -> None:
+        """Raise if x is too long, or for ``space="input"`` no vector without NaN."""
+        if self.space is not None:
+            network_of(data.estimator, self.space)
+        if self.space == "input":
+            as_batch("x", data.pairs.x)
+            as_batch("x of simulations", data.simulations[1])
+
+
+class DiscrepancyCandidate(CorrectingCandidate):
     """NPE trained on corrected simulations, as learned from the pairs.
 
     See :class:`~sbi_rope.discrepancy.DiscrepancyNPE`.
@@ -194,66 +214,24 @@ class DiscrepancyCandidate(Settings, Candidate):
         space: What is corrected: the embedding h(x), the input x, or the embedding
             by tuned nets.
         learn_prior: Whether the distribution of parameters is learned from the pairs.
-            The scores of a stack assume in any case that the pairs are drawn like the
-            observations to be inferred.
     """
 
-    space: Space = "embedding"
-    learn_prior: bool = True
     family = "discrepancy"
 
-    @property
-    def needs(self) -> str:  # type: ignore[override]
-        """What the data need for it."""
-        return NEEDS[self.space]
-
-    @property
-    def name(self) -> str:  # type: ignore[override]
-        """The name of the method and its setting."""
-        space = "" if self.space == "embedding" else f" ({self.space})"
-        return f"discrepancy{space}" + ("" if self.learn_prior else ", given prior")
-
-    @property
-    def learns_prior(self) -> bool:  # type: ignore[override]
-        """Whether it learns from the pairs how parameters are distributed."""
-        return self.learn_prior
-
-    def suits(self, data: StackData) -> bool:
-        """Tell whether x is a short vector, or else there are folds enough to tune.
-
-        A short vector is corrected as it is, so that tuned nets add nothing.
-        """
-        if self.space == "input":
-            return data.reads_summaries
-        return self.space == "embedding" or _tunes(data)
-
-    def check(self, data: StackData) -> None:
-        """Raise if x is too long, or for ``space="input"`` no vector without NaN."""
-        _check_space(data, self.space)
+    def __init__(self, *, space: Space = "embedding", learn_prior: bool = True) -> None:
+        check("space", space, Space)
+        check("learn_prior", learn_prior, bool)
+        self.space, self.learns_prior, self.needs = space, learn_prior, NEEDS[space]
+        self.name = NAMES[space] + ("" if learn_prior else ", given prior")
 
     def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
         """Train NPE on corrected simulations."""
-        nets = tuned(data, versions) if self.space == "tuned" else None
-        found = corrected(data, versions, self.space, learn_prior=self.learn_prior)
-        if nets is None:
-            return [found.flow[[version]] for version in range(len(versions))]
-        behind = nets.nets.then(found.constants)
-        return [
-            found.flow.made_of([(net, version) for net in nets.of(rows, data)], behind)
-            for version, rows in enumerate(versions)
-        ]
-
-
-def _check_space(data: StackData, space: Space | None) -> None:
-    if space is not None:
-        network_of(data.estimator, space)  # raises if it cannot be corrected
-    if space == "input":
-        as_batch("x", data.pairs.x)
-        as_batch("x of simulations", data.simulations[1])
-
-
-def _tunes(data: StackData) -> bool:
-    return not data.reads_summaries and len(data.folds) > 2
+        flow, members = started(
+            data, versions, self.space, learn_prior=self.learns_prior
+        )
+        # Other spaces have the same flow for all parts of a version.
+        several = None if self.space == "tuned" else 1
+        return [flow[numbers[:several]] for numbers in members]
 
 
 def corrected(
@@ -262,32 +240,30 @@ def corrected(
     """Return NPE trained on corrected simulations, a copy for each version."""
     key = space, learn_prior, key_of(versions)
     if key not in data.kept:
-        z_s = data.simulated(space)
+        z_s = data.simulations[1] if space == "input" else data.embedded
+        simulations = data.simulations[0], z_s
         if space == "tuned":
             nets = tuned(data, versions)
             z = [nets.held_out(rows, data) for rows in versions]
         else:
             net = network_of(data.estimator, space)
             z = [embed(net, data.pairs.x[rows]) for rows in versions]
-        discrepancies = [
-            fit_discrepancy(
+        fitted: list[Version] = [
+            fit_version(
+                data.pairs[rows],
                 of_rows,
                 data.moments(rows, space),
-                Standardisation(z_s.double()),
+                simulations,
                 data.model,
-                weights=data.pairs.weight[rows],
-                groups=data.pairs.group[rows],
+                learn_prior=learn_prior,
             )
             for of_rows, rows in zip(z, versions, strict=True)
         ]
         data.kept[key] = correct_flow(
             data.estimator,
-            (data.simulations[0], z_s),
-            discrepancies,
+            simulations,
+            fitted,
             space=space,
-            probabilities=[
-                data.probabilities(rows) if learn_prior else None for rows in versions
-            ],
             in_a_stack=True,
             show_progress_bars=data.show,
         )
@@ -296,15 +272,10 @@ def corrected(
 
 @dataclass(frozen=True, eq=False)
 class Tuned:
-    """Embedding nets that are tuned on sets of pairs.
-
-    Attributes:
-        nets: The nets.
-        number: The number of the net that was tuned on a set of rows.
-    """
+    """Embedding nets that are tuned on sets of pairs."""
 
     nets: Ensemble
-    number: dict[Any, int]
+    number: dict[Any, int]  # of the net that was tuned on a set of rows
 
     def of(self, rows: Tensor, data: StackData) -> list[int]:
         """Return the numbers of the nets that do not see each part of some rows."""
@@ -313,9 +284,8 @@ class Tuned:
     def held_out(self, rows: Tensor, data: StackData) -> Tensor:
         """Return the embeddings of pairs by nets that have not seen them."""
         z = data.embedded.new_empty(len(data), data.embedded.shape[1])
-        for number, (_, part) in zip(
-            self.of(rows, data), _seen(rows, data), strict=True
-        ):
+        parts = [part for _, part in _seen(rows, data)]
+        for number, part in zip(self.of(rows, data), parts, strict=True):
             z[part] = embed(self.nets.member(number), data.pairs.x[part])
         return z[rows]
 
@@ -347,19 +317,44 @@ def tuned(data: StackData, versions: Sequence[Tensor]) -> Tuned:
     return data.kept[key]
 
 
+def started(
+    data: StackData,
+    versions: Sequence[Tensor],
+    space: Space | None,
+    *,
+    learn_prior: bool = True,
+) -> tuple[Flow, list[list[int]]]:
+    """Return NPE, corrected or not, for each part of each version; their numbers."""
+    numbers: list[list[int]] = []
+    of_version: list[int] = []
+    for version, rows in enumerate(versions):
+        first, count = len(of_version), len(_seen(rows, data))
+        numbers.append([*range(first, first + count)])
+        of_version += [version] * count
+    if space is None:
+        flow = Flow.of([data.estimator])
+        return flow.made_of([(0, 0)] * len(of_version)), numbers
+    found = corrected(data, versions, space, learn_prior=learn_prior)
+    if space == "embedding":
+        return found.flow.behind_one_net(of_version), numbers
+    of_nets, nets = [min(v, len(found.flow.nets) - 1) for v in of_version], None
+    if space == "tuned":
+        of_parts = tuned(data, versions)
+        of_nets = [number for rows in versions for number in of_parts.of(rows, data)]
+        nets = of_parts.nets.then(found.constants)
+    members = list(zip(of_nets, of_version, strict=True))
+    return found.flow.made_of(members, nets), numbers
+
+
 # How NPE is fine-tuned. Behind a corrected x all parameters were trained already, and a
 # smaller rate is enough. Chosen on calibration data, see benchmarks/choices.md.
 LEARNING_RATE, LEARNING_RATE_OF_INPUT = 1e-3, 3e-4
-# Training with rehearsal stops after so many epochs without improvement. No other
-# number was tried. What it gains on calibration data is in benchmarks/choices.md.
-REHEARSED = replace(FINETUNING, stop_after_epochs=10)
-# Pairs with different parameters. On calibration data it was worse than fine-tuned NPE
-# with 50, and better with 200; nothing between was tried.
-MIN_TO_REHEARSE = 100
+# With rehearsal, and pairs with different parameters that it needs: on calibration data
+# it was worse than fine-tuned NPE with 50, and better with 200.
+REHEARSED, MIN_TO_REHEARSE = replace(FINETUNING, stop_after_epochs=10), 100
 
 
-@dataclass(frozen=True, kw_only=True)
-class FinetunedCandidate(Settings, Candidate):
+class FinetunedCandidate(CorrectingCandidate):
     r"""NPE, unchanged or corrected, whose parameters are then trained on the pairs.
 
     It is the average of several nets. Each of them holds out another part of the
@@ -367,86 +362,51 @@ class FinetunedCandidate(Settings, Candidate):
     density is trained.
 
     Args:
-        space: None starts from the unchanged NPE. Otherwise, what is corrected in the
-            NPE that it starts from.
-        rehearse: Whether to train on simulations, too, so as to minimise what
-            :class:`~sbi_rope.baselines.JointNPE` minimises from scratch. It is for
-            images, series and sets of trials, where the embedding net has to learn what
+        space: What is corrected in the NPE that it starts from; nothing if None.
+        rehearse: Whether to train on simulations, too, as
+            :class:`~sbi_rope.baselines.JointNPE` does from scratch. It is for images,
+            series and sets of trials, where the embedding net has to learn what
             simulations do not show. A version then holds out a single part.
     """
 
-    space: Space | None = None
-    rehearse: bool = False
-
-    @property
-    def name(self) -> str:  # type: ignore[override]
-        """The name of the method and its setting."""
-        name = "fine-tuned NPE"
-        if self.space is not None:
-            name = f"{DiscrepancyCandidate(space=self.space).name}, fine-tuned"
-        return f"{name}, rehearsed" if self.rehearse else name
-
-    @property
-    def family(self) -> str:  # type: ignore[override]
-        """The method that it is a setting of."""
-        return "fine-tuned NPE" if self.space is None else "discrepancy, fine-tuned"
-
-    @property
-    def needs(self) -> str:  # type: ignore[override]
-        """What the data need for it."""
-        needs = f"{MIN_TO_REHEARSE} pairs, long x" if self.rehearse else "3 folds"
-        if self.space is not None:
-            needs = "long x" if self.space == "embedding" else NEEDS[self.space]
-        return needs
+    def __init__(self, *, space: Space | None = None, rehearse: bool = False) -> None:
+        check("space", space, Space | None)
+        check("rehearse", rehearse, bool)
+        self.space, self.rehearse = space, rehearse
+        self.name = self.family = "fine-tuned NPE"
+        self.needs = f"{MIN_TO_REHEARSE} pairs, long x" if rehearse else "3 folds"
+        if space is not None:
+            self.family = "discrepancy, fine-tuned"
+            self.name = f"{NAMES[space]}, fine-tuned"
+            self.needs = NEEDS[space] or "long x"
+        self.name += ", rehearsed" if rehearse else ""
 
     def suits(self, data: StackData) -> bool:
-        """Tell whether there are parts to hold out, and the starting NPE applies.
-
-        The embedding is corrected first where x itself is not.
-        """
+        """Tell whether there are parts to hold out, and the starting NPE applies."""
         if len(data.folds) < 3:
             return False
         if self.rehearse:
             return data.pairs.num_groups >= MIN_TO_REHEARSE and not data.is_short
-        if self.space == "embedding":
+        if self.space == "embedding":  # x itself is corrected otherwise
             return not data.reads_summaries
-        return self.space is None or DiscrepancyCandidate(space=self.space).suits(data)
-
-    def check(self, data: StackData) -> None:
-        """Raise if x is too long, or for ``space="input"`` no vector without NaN."""
-        _check_space(data, self.space)
+        return super().suits(data)
 
     def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
         """Train one net without each part of the pairs of each version."""
-        nets = tuned(data, versions) if self.space == "tuned" else None
-        if self.space is None:
-            start, behind = Flow.of([data.estimator]), None
-        else:
-            found = corrected(data, versions, self.space, learn_prior=True)
-            start = found.flow
-            behind = None if nets is None else nets.nets.then(found.constants)
-        starts, jobs = [], []
+        flow, members = started(data, versions, self.space)
+        starts: list[Density] = [flow[numbers] for numbers in members]
+        jobs, of_version = [], []
         for version, rows in enumerate(versions):
-            # Numbers of net and density. Versions may share either.
-            of_parts = [min(version, len(start.nets) - 1)] * len(_seen(rows, data))
-            if nets is not None:
-                of_parts = nets.of(rows, data)
-            density = min(version, len(start.densities) - 1)
-            members = [(net, density) for net in of_parts]
-            starts.append(start.made_of(members, behind))
-            nodes = data.nodes(rows, starts[-1])
-            own = list(zip(members, data.holdouts(rows), strict=False))  # or none
-            if self.rehearse:
-                own = own[version % max(1, len(own)) :][:1]
-            jobs += [(version, *job, nodes) for job in own]
-        if not jobs:
+            nodes = data.nodes(rows, starts[version])
+            own = list(zip(members[version], data.holdouts(rows), strict=False))
+            if self.rehearse and own:
+                own = [own[version % len(own)]]
+            of_version.append([*range(len(jobs), len(jobs) + len(own))])
+            jobs += [(*job, nodes) for job in own]
+        if not jobs:  # there is nothing to hold out
             return starts
-        of_version, members, splits, labels = zip(*jobs, strict=True)
-        # The net h has not changed, so that the density behind it is enough to train.
-        only_densities = self.space == "embedding"
-        flow = start.made_of(members, behind)
-        if only_densities:
-            flow = start.behind_one_net([density for _, density in members])
+        numbers, splits, labels = zip(*jobs, strict=True)
+        flow = flow[numbers]
         rate = LEARNING_RATE_OF_INPUT if self.space == "input" else LEARNING_RATE
         finetune_flow(
             flow,
@@ -457,25 +417,19 @@ class FinetunedCandidate(Settings, Candidate):
             learning_rates=[rate] * len(jobs),
             weights=data.pairs.weight,
             rehearsed=data.simulations if self.rehearse else None,
-            only_densities=only_densities,
+            # The net h has not changed, so that it is enough to train the density.
+            only_densities=self.space == "embedding",
             show_progress_bars=data.show,
         )
-        trained = [
-            [k for k, of in enumerate(of_version) if of == version]
-            for version in range(len(versions))
-        ]
-        return [
-            flow[numbers] if numbers else one
-            for numbers, one in zip(trained, starts, strict=True)
-        ]
+        trained = zip(of_version, starts, strict=True)
+        return [flow[own] if own else start for own, start in trained]
 
 
 # With fewer pairs the candidate is left out.
 MIN_TO_REGRESS = 10
 
 
-@dataclass(frozen=True, kw_only=True)
-class RegressionCandidate(Settings, Candidate):
+class RegressionCandidate(Candidate):
     """A Gaussian process of the labels, which needs no simulator.
 
     See :class:`~sbi_rope.density.GaussianProcess`.
@@ -484,27 +438,22 @@ class RegressionCandidate(Settings, Candidate):
         space: What it depends on: x itself, with ``"input"``, or the embedding h(x).
     """
 
-    space: Literal["embedding", "input"] = "input"
-    family = "regression"
+    name = family = "regression"
+    needs = f"{MIN_TO_REGRESS} exact labels of continuous parameters, x without NaN"
 
-    @property
-    def needs(self) -> str:  # type: ignore[override]
-        """What the data need for it."""
-        needs = f"{MIN_TO_REGRESS} exact labels of continuous parameters, x without NaN"
-        return needs + (", an embedding net" if self.space == "embedding" else "")
-
-    @property
-    def name(self) -> str:  # type: ignore[override]
-        """The name of the method and its setting."""
-        return "regression" + (" (embedding)" if self.space == "embedding" else "")
+    def __init__(self, *, space: Literal["embedding", "input"] = "input") -> None:
+        check("space", space, Literal["embedding", "input"])
+        self.embeds = space == "embedding"
+        if self.embeds:
+            self.name += " (embedding)"
+            self.needs += ", an embedding net"
 
     def suits(self, data: StackData) -> bool:
         """Tell whether the data are as it needs them."""
-        if self.space == "embedding" and not has_parameters(data.embedding_net):
-            return False
         theta, pairs = data.pairs.mean, data.pairs
         return (
-            pairs.num_groups >= MIN_TO_REGRESS
+            (has_parameters(data.embedding_net) or not self.embeds)
+            and pairs.num_groups >= MIN_TO_REGRESS
             and pairs.are_exact
             and bool((theta != theta[0]).any(dim=0).all())
             and bool(torch.isfinite(pairs.x).all())
@@ -514,7 +463,7 @@ class RegressionCandidate(Settings, Candidate):
     def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
         """Fit a process to each version of the pairs."""
         pairs, net = data.pairs, None
-        if self.space == "embedding":
+        if self.embeds:
             net = data.embedding_net
         elif pairs.x.ndim == 2 and torch.isfinite(x_s := data.simulations[1]).all():
             # Entries that never vary in simulations are ignored, as by all candidates.
@@ -536,33 +485,28 @@ class RegressionCandidate(Settings, Candidate):
 MIN_OBSERVATIONS, MAX_OBSERVATIONS, MAX_ENTRIES = 30, 200, 10
 
 
-@dataclass(frozen=True, eq=False)
-class UnlabelledCandidate(Candidate):
+class UnlabelledCandidate(CorrectingCandidate):
     """NPE trained on corrected simulations, as learned from unlabelled x, too.
 
-    The density of an observation without label is closed for a Gaussian mixture of
-    simulations, see ``sbi_rope.discrepancy.unlabelled``. It assumes that the parameters
-    of the observations follow the prior. The labels decide about its weight.
+    It assumes that the parameters of the observations follow the prior, see
+    ``sbi_rope.discrepancy.unlabelled``. The labels decide about its weight.
 
     Args:
-        x_o: Real observations, shape ``(n_o, l)``. The stack may be asked about these
-            or about others. The observations of the calibration pairs should not be
-            among them, so that the scores are those of new observations. If there are
-            more than 200, so many are drawn.
+        x_o: Real observations, shape ``(n_o, l)``, of which up to 200 are used. Those
+            of the calibration pairs should not be among them, so that the scores are
+            those of new observations. The stack may be asked about others, too.
 
     Raises:
-        InvalidInputError: If x_o holds no numbers. Shape and values of x_o are checked
-            when the stack is made.
+        InvalidInputError: If x_o holds no numbers. Its shape is checked in the stack.
     """
 
-    x_o: Tensor = field(repr=False)
     name = "discrepancy, with x_o"
     learns_prior = False
     needs = f"{MIN_OBSERVATIONS} observations of {MAX_ENTRIES} numbers, exact labels"
+    space = "input"
 
-    def __post_init__(self) -> None:
-        """Take a copy of the observations."""
-        object.__setattr__(self, "x_o", as_numbers("x_o", self.x_o).clone())
+    def __init__(self, x_o: Tensor) -> None:
+        self.x_o = as_numbers("x_o", x_o).clone()
 
     def suits(self, data: StackData) -> bool:
         """Tell whether there are enough observations, of few entries."""
@@ -577,17 +521,17 @@ class UnlabelledCandidate(Candidate):
     def check(self, data: StackData) -> None:
         """Raise for observations of another shape, and those that are not finite."""
         as_batch("x_o", data.rope.checked_observations(self.x_o))
-        _check_space(data, "input")
+        super().check(data)
 
     def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
         """Train NPE on corrected simulations."""
-        theta_s, x_s = data.simulations
+        x_s = data.simulations[1]
         unit = Standardisation(x_s.double())
         chosen = torch.randperm(len(self.x_o))[:MAX_OBSERVATIONS]
         rows = torch.cat(list(versions)).unique()
         weight = data.pairs.shared_weight[rows]
         is_seen = torch.stack([torch.isin(rows, seen) for seen in versions])
-        discrepancies = fit_unlabelled(
+        found = fit_unlabelled(
             unit(data.pairs.x[rows].double()),
             in_units(data.moments(rows, "input"), unit),
             weight.where(is_seen, 0.0).double(),
@@ -597,10 +541,9 @@ class UnlabelledCandidate(Candidate):
         )
         flow = correct_flow(
             data.estimator,
-            (theta_s, x_s),
-            discrepancies,
+            data.simulations,
+            [(one, None) for one in found],
             space="input",
-            probabilities=[None] * len(versions),
             in_a_stack=True,
             show_progress_bars=data.show,
         ).flow
@@ -608,27 +551,21 @@ class UnlabelledCandidate(Candidate):
 
 
 def default_candidates(
-    rope: RoPE | None = None,
-    x_o: Tensor | None = None,
-    *,
-    learn_prior: bool = True,
+    rope: RoPE | None = None, x_o: Tensor | None = None, *, learn_prior: bool = True
 ) -> tuple[Candidate, ...]:
     """Return the prior, NPE, fine-tuned NPE, discrepancy models, and regressions.
-
-    NPE is fine-tuned on the pairs alone, and from discrepancy models, and on pairs and
-    simulations together. Regressions do without the simulator.
 
     Args:
         rope: A RoPE with its calibration pairs. Candidates that these data do not
             allow or need are left out, as in :func:`stack`. None returns all.
         x_o: Real observations without labels, shape ``(n_o, *event)``, other than those
-            of the pairs. They add a discrepancy that is learned from them, too. With a
-            rope, it is left out if there are fewer than 30, x is no vector of at most
-            ten entries, or labels are not exact.
+            of the pairs. They add a discrepancy that is learned from them, too, unless
+            they are fewer than 30 or no vectors of at most ten entries, or labels are
+            not exact.
         learn_prior: Whether candidates may learn from the pairs how parameters are
             distributed. They should if the pairs are drawn like the observations to be
-            inferred. With False, discrepancy models keep the prior of NPE.
-            Fine-tuned candidates cannot keep it, and are left out.
+            inferred. With False, discrepancy models keep the prior of NPE, and others
+            that are trained on pairs are left out.
 
     Raises:
         InvalidInputError: If an argument has the wrong type, or, with a rope, x_o has
@@ -641,21 +578,16 @@ def default_candidates(
     check("rope", rope, RoPE)
     x_o = None if x_o is None else rope.checked_observations(x_o)
     data = StackData(rope, num_folds=NUM_FOLDS, seed=0, show_progress_bars=False)
-    return suitable_candidates(data, x_o, learn_prior=learn_prior)
+    return _suitable_candidates(data, x_o, learn_prior=learn_prior)
 
 
-def suitable_candidates(
+def _suitable_candidates(
     data: StackData, x_o: Tensor | None, *, learn_prior: bool = True
 ) -> tuple[Candidate, ...]:
     """Return the default candidates that the data allow; warn if x_o adds none."""
-    chosen = tuple(
-        candidate
-        for candidate in _all_candidates(x_o, learn_prior=learn_prior)
-        if candidate.suits(data)
-    )
-    if x_o is not None and not any(
-        isinstance(one, UnlabelledCandidate) for one in chosen
-    ):
+    known = _all_candidates(x_o, learn_prior=learn_prior)
+    chosen = tuple(candidate for candidate in known if candidate.suits(data))
+    if x_o is not None and known[-1] not in chosen:
         warn_user(
             f"`x_o` adds no candidate, which takes {MIN_OBSERVATIONS} observations of "
             f"at most {MAX_ENTRIES} numbers, and exact labels; got {len(x_o)} of shape "
@@ -667,40 +599,33 @@ def suitable_candidates(
 def left_out(candidates: Sequence[Candidate], x_o: Tensor | None) -> str:
     """Return which default candidates are not among some, and what they need."""
     names = {candidate.name for candidate in candidates}
-    missing = [
+    return "; ".join(
         f"{one.name} (needs {one.needs})"
         for one in _all_candidates(x_o, learn_prior=True)
         if one.name not in names
-    ]
-    return "; ".join(missing)
+    )
 
 
 def _all_candidates(x_o: Tensor | None, *, learn_prior: bool) -> tuple[Candidate, ...]:
-    candidates: tuple[Candidate, ...] = (
+    spaces: tuple[Space, ...] = ("embedding", "input", "tuned")
+    candidates: list[Candidate] = [
         PriorCandidate(),
         NPECandidate(),
         FinetunedCandidate(),
-        DiscrepancyCandidate(space="embedding", learn_prior=learn_prior),
-        DiscrepancyCandidate(space="input", learn_prior=learn_prior),
-        DiscrepancyCandidate(space="tuned", learn_prior=learn_prior),
-        FinetunedCandidate(space="embedding"),
-        FinetunedCandidate(space="input"),
-        FinetunedCandidate(space="tuned"),
+        *(DiscrepancyCandidate(space=one, learn_prior=learn_prior) for one in spaces),
+        *(FinetunedCandidate(space=one) for one in spaces),
         FinetunedCandidate(rehearse=True),
         RegressionCandidate(),
         RegressionCandidate(space="embedding"),
-    )
-    if not learn_prior:
-        candidates = tuple(one for one in candidates if not one.learns_prior)
-    if x_o is not None:
-        candidates += (UnlabelledCandidate(x_o),)
-    return candidates
+        *([] if x_o is None else [UnlabelledCandidate(x_o)]),
+    ]
+    return tuple(one for one in candidates if learn_prior or not one.learns_prior)
 
 
 def chosen_candidates(
     candidates: Sequence[Any] | None, data: StackData, x_o: Tensor | None
 ) -> tuple[Candidate, ...]:
-    """Return the candidates of a user, or those by default.
+    """Return the candidates of a user, or those by default, all of which can be used.
 
     Raises:
         InvalidInputError: If there is none, two have the same name, or entries of x are
@@ -709,7 +634,7 @@ def chosen_candidates(
     """
     check("candidates", candidates, Sequence | None)
     if candidates is None:
-        candidates = suitable_candidates(data, x_o)
+        candidates = _suitable_candidates(data, x_o)
     chosen = tuple(
         one if isinstance(one, Candidate) else GivenCandidate(one) for one in candidates
     )

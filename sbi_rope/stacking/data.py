@@ -16,7 +16,6 @@ from sbi_rope.data import Nodes
 from sbi_rope.density.base import Density
 from sbi_rope.discrepancy.correction import Space, tuning_targets
 from sbi_rope.discrepancy.model import DiscrepancyModel
-from sbi_rope.discrepancy.parameters import learn_parameters
 from sbi_rope.discrepancy.report import DiscrepancyReport, report_discrepancy
 from sbi_rope.errors import NotReadyError
 from sbi_rope.labels import nodes_of, reference_of
@@ -25,19 +24,17 @@ from sbi_rope.simulate import Moments, moments
 
 __all__ = ["StackData", "draw_seeds"]
 
-# Simulations from the prior that the corrected candidates are trained on.
-NUM_SIMULATIONS = 10_000
-# Simulations at the parameters of each pair.
-SIMULATIONS_PER_PAIR = 100
+# Simulations from the prior that the corrected candidates are trained on, and
+# simulations at the parameters of each pair.
+NUM_SIMULATIONS, SIMULATIONS_PER_PAIR = 10_000, 100
 # A vector x with more entries is not treated as a list of summaries.
 MAX_SUMMARIES = 20
 # Samples of an estimator that is trained on labels that are not exact, and the nodes at
 # which their density is computed.
 NUM_SAMPLES, NUM_NODES = 200, 64
-# A single fold is divided into so many parts, and a net is trained without each.
-NUM_INNER_FOLDS = 5
-# Folds of the calibration pairs.
-NUM_FOLDS = 5
+# Folds of the calibration pairs, and parts of a single fold, a net without each of
+# which is trained.
+NUM_FOLDS, NUM_INNER_FOLDS = 5, 5
 
 
 def draw_seeds(seed: int | None, count: int) -> list[int]:
@@ -54,23 +51,18 @@ class StackData:
     that say what it depends on.
 
     Args:
-        rope: RoPE with all calibration pairs.
+        rope: RoPE with all calibration pairs, of at least two groups.
         num_folds: Number of folds. There are at most as many as groups of pairs.
         seed: Seed of everything random.
         show_progress_bars: Whether to show the progress of trainings and simulations.
-
-    Raises:
-        NotReadyError: If there are fewer than two groups of pairs.
     """
 
     def __init__(
         self, rope: RoPE, *, num_folds: int, seed: int, show_progress_bars: bool
     ) -> None:
-        self.rope, self.show = rope, show_progress_bars
-        self.npe = rope.npe
-        self.estimator = estimator_of(self.npe)
-        self.prior, self.source = PriorDistribution(self.npe.prior), rope.source
-        self.pairs = rope.pairs
+        self.rope, self.npe, self.show = rope, rope.npe, show_progress_bars
+        self.estimator, self.source = estimator_of(self.npe), rope.source
+        self.prior, self.pairs = PriorDistribution(self.npe.prior), rope.pairs
         self.model = DiscrepancyModel()
         if (count := self.pairs.num_groups) < 2:
             raise NotReadyError(
@@ -99,10 +91,7 @@ class StackData:
         return torch.cat(self.folds)
 
     def parts(self, rows: Tensor) -> list[Tensor]:
-        """Cut rows into parts that are held out in turn.
-
-        These are the folds. A single fold is divided further, by groups.
-        """
+        """Cut rows into folds, of which one alone is divided further by groups."""
         folds = [fold for fold in self.folds if torch.isin(fold, rows).all()]
         if len(folds) > 1:
             return folds
@@ -118,9 +107,8 @@ class StackData:
 
     def seed_of(self, rows: Tensor) -> int:
         """Return the seed of what is drawn for some rows."""
-        sequence = np.random.SeedSequence(
-            self.seed, spawn_key=rows.sort().values.tolist()
-        )
+        key = rows.sort().values.tolist()
+        sequence = np.random.SeedSequence(self.seed, spawn_key=key)
         return int(sequence.generate_state(1)[0])
 
     # --- simulations ---
@@ -140,35 +128,29 @@ class StackData:
         """The embeddings h(x) of :attr:`simulations`, shape ``(n_s, l)``."""
         return embed(self.embedding_net, self.simulations[1])
 
-    def simulated(self, space: Space) -> Tensor:
-        """Return the representation of :attr:`simulations` that is corrected."""
-        return self.simulations[1] if space == "input" else self.embedded
-
     def moments(self, rows: Tensor, space: Space) -> Moments:
         """Return moments of simulations at some pairs: of x with "input", else h(x)."""
-        numbers = [
-            k for k, fold in enumerate(self.folds) if torch.isin(fold, rows).any()
-        ]
-        parts = [self._moments(number, space) for number in numbers]
+        used = [k for k, fold in enumerate(self.folds) if torch.isin(fold, rows).any()]
+        parts = [self._moments(number, space) for number in used]
         found = Moments(
             means=torch.cat([part.means for part in parts]),
             covariance=torch.cat([part.covariance for part in parts]),
         )
+        of_found = torch.cat([self.folds[number] for number in used])
         place = torch.zeros(len(self), dtype=torch.long, device=rows.device)
-        used = torch.cat([self.folds[number] for number in numbers])
-        place[used] = torch.arange(len(used), device=rows.device)
+        place[of_found] = torch.arange(len(of_found), device=rows.device)
         return found[place[rows]]
 
     def _moments(self, fold: int, space: Space) -> Moments:
         h, rows = self.embedding_net, self.folds[fold]
-        width = self.embedded.shape[1]
+        of_x = space == "input"
 
         def represent(x: Tensor) -> Tensor:
             # Side by side if x is short, so that both are of the same simulations.
-            parts = [embed(h, x)] * (space != "input" or self.is_short)
-            return torch.cat(parts + [x] * (space == "input" or self.is_short), dim=1)
+            parts = [embed(h, x)] * (self.is_short or not of_x)
+            return torch.cat(parts + [x] * (self.is_short or of_x), dim=1)
 
-        key = "moments", fold, self.is_short or space == "input"
+        key = "moments", fold, self.is_short or of_x
         if key not in self.kept:
             with seeded(self.seed_of(rows)):
                 self.kept[key] = moments(
@@ -178,10 +160,10 @@ class StackData:
                     represent,
                     progress=self.show,
                 )
-        both: Moments = self.kept[key]
-        if space == "input":
-            return both.columns(slice(width if self.is_short else 0, None))
-        return both.columns(slice(0, width))
+        width = self.embedded.shape[1]
+        if of_x:
+            return self.kept[key].columns(slice(width if self.is_short else 0, None))
+        return self.kept[key].columns(slice(0, width))
 
     # --- what x is like ---
 
@@ -191,17 +173,16 @@ class StackData:
         return self.pairs.x.ndim == 2 and self.pairs.x.shape[1] <= MAX_SUMMARIES
 
     @cached_property
-    def has_summaries(self) -> bool:
-        """Whether x is a vector of so few entries that it can be corrected itself."""
-        # Missing entries (NaN) can be embedded, but not corrected.
-        return self.is_short and bool(torch.isfinite(self.pairs.x).all())
-
-    @cached_property
     def compares_entries(self) -> bool:
         """Whether x is a short vector without missing entries, simulated or real."""
-        return self.has_summaries and bool(torch.isfinite(self.simulations[1]).all())
+        # Missing entries (NaN) can be embedded, but not corrected.
+        return (
+            self.is_short
+            and bool(torch.isfinite(self.pairs.x).all())
+            and bool(torch.isfinite(self.simulations[1]).all())
+        )
 
-    @cached_property
+    @property
     def reads_summaries(self) -> bool:
         """Whether entries of x can be corrected, and NPE has an embedding net.
 
@@ -214,39 +195,26 @@ class StackData:
     def targets(self, rows: Tensor) -> Tensor:
         """Return targets of tuning for all pairs, computed from some pairs alone."""
         of_rows, pairs = self.moments(rows, "embedding"), self.pairs[rows]
-        if self.pairs.are_exact:
-            found = of_rows.mean.to(self.embedded)
-        else:
+        found = of_rows.mean.to(self.embedded)
+        if not self.pairs.are_exact:
             found = tuning_targets(
                 embed(self.embedding_net, pairs.x),
                 of_rows,
                 Standardisation(self.embedded.double()),
-                weights=pairs.weight,
-                groups=pairs.group,
+                pairs.weight,
+                pairs.group,
                 seed=self.seed_of(rows),
             )
         targets = found.new_zeros(len(self), found.shape[1])
         targets[rows] = found
         return targets
 
-    def probabilities(self, rows: Tensor) -> Tensor:
-        """Return how to draw simulations so that theta is like that of some pairs."""
-        return learn_parameters(
-            self.pairs.theta[rows],
-            self.simulations[0],
-            weights=self.pairs.shared_weight[rows],
-        ).probabilities
-
     @torch.no_grad()
     def nodes(self, rows: Tensor, start: Density) -> Nodes:
-        """Return nodes to compute the density of labels at, for all pairs.
+        """Return nodes to compute the density of labels at, of use for these rows only.
 
-        An estimator that is trained may move away from where it starts, so that the
-        nodes spread as far as the prior does. Only those of the rows given are of use.
-
-        Args:
-            rows: The pairs to train on.
-            start: The density that the training starts from.
+        The density that is trained may move away from its ``start``, so that the nodes
+        spread as far as the prior does.
         """
         if self.pairs.are_exact:
             return Nodes.exact(self.pairs.mean)
@@ -278,10 +246,6 @@ class StackData:
         )
 
 
-def _key(rows: Tensor) -> Hashable:
-    return tuple(rows.tolist())
-
-
 def key_of(versions: Sequence[Tensor]) -> Hashable:
     """Return a key for what is trained on some rows in each version."""
-    return tuple(map(_key, versions))
+    return tuple(tuple(rows.tolist()) for rows in versions)

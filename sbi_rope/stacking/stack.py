@@ -16,17 +16,11 @@ from sbi_rope._sbi import check_density, embed, headless
 from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope._statistics import TwoSampleTest, compare_with_pairs
 from sbi_rope.density import Density
-from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.discrepancy.parameters import probability_of_prior
 from sbi_rope.errors import warn_user
 from sbi_rope.rope import RoPE
 from sbi_rope.settings import Range, check, default_names
-from sbi_rope.stacking.candidates import (
-    Candidate,
-    as_densities,
-    chosen_candidates,
-    left_out,
-)
+from sbi_rope.stacking.candidates import as_densities, chosen_candidates, left_out
 from sbi_rope.stacking.data import NUM_FOLDS, StackData, draw_seeds
 from sbi_rope.stacking.posterior import StackedPosterior, Versions
 from sbi_rope.stacking.report import LearningCurve, StackingReport
@@ -57,24 +51,21 @@ def stack(
     candidates with the weights that score best
     (:func:`~sbi_rope.stacking.stacking_weights`). It answers any x.
 
-    The stack is made of the models that were scored. Each candidate is the average of
-    its versions: one for each fold, trained on the other folds, and one trained on all
-    pairs. The held-out score is that of single versions. By Jensen's inequality their
-    average has a higher expected score, for observations like those of the pairs. The
-    version trained on all pairs is not scored.
+    Each candidate is the average of its versions: those that were scored, one for each
+    fold, and one trained on all pairs. By Jensen's inequality the average has a higher
+    expected score than single versions, for observations like those of the pairs.
 
-    The weights, the scores and the calibration in the report hold for observations like
-    those of the pairs. With ``x_o`` the two are compared by an energy test of their
-    embeddings, and a p-value below 0.01 gives a warning. Without it,
-    :func:`~sbi_rope.diagnose` makes the same comparison.
+    Weights, scores and calibration in the report hold for such observations. With
+    ``x_o`` these are compared with the pairs by an energy test of their embeddings, and
+    a p-value below 0.01 gives a warning. Without it, :func:`~sbi_rope.diagnose` makes
+    the same comparison.
 
     Args:
-        rope: A RoPE with calibration pairs. It need not be trained, and it is not
-            changed, except that it counts calls of the simulator, and the simulations
-            that are dropped.
+        rope: A RoPE with calibration pairs. It need not be trained. Only its counts of
+            calls of the simulator and of dropped simulations change.
         x_o: Real observations without labels, shape ``(n_o, *event)``, other than those
-            of the pairs. If there are 30 vectors of at most ten entries, the default
-            candidates have a discrepancy among them that is learned from them, too.
+            of the pairs. A default candidate learns its discrepancy from them, too, if
+            they are 30 vectors or more of at most ten entries.
         candidates: What to stack;
             :func:`default_candidates(rope, x_o)
             <sbi_rope.stacking.default_candidates>` if None: the prior, NPE, fine-tuned
@@ -92,8 +83,7 @@ def stack(
             a terminal or a notebook, but not in a file.
 
     Returns:
-        The stack, an sbi posterior. Its ``report`` holds the held-out scores, and
-        compares the stack with the prior and with NPE.
+        The stack, an sbi posterior with a ``report``.
 
     Raises:
         NotReadyError: If there are fewer than two groups of pairs.
@@ -127,12 +117,15 @@ def stack(
     # These come first, so that nobody waits for the training to hear of it.
     stacked = chosen_candidates(candidates, data, x_o)
     batch = None if x_o is None else _compare_batch(data, x_o)
-    numbers = range(len(data.folds))
+    # Versions are trained on all folds but one, and for the curve on fewer.
+    num_folds = len(data.folds)
+    smaller = {int(share * num_folds) for share in SMALLER if learning_curve}
+    counts = {num_folds - 1, *(n for n in smaller if 0 < n < num_folds - 1)}
     points: list[StackingReport] = []
     seconds = dict.fromkeys((candidate.name for candidate in stacked), 0.0)
     fitted: list[list[Density]] = []
-    for count in _numbers_of_folds(len(numbers), curve=learning_curve):
-        versions = [data.without(k, count) for k in numbers]
+    for count in sorted(counts, reverse=True):
+        versions = [data.without(k, count) for k in range(num_folds)]
         if not fitted:
             versions.append(data.every)
         found = []
@@ -148,6 +141,8 @@ def stack(
         points.append(
             score_folds(data, stacked, found, num_training_folds=count, seed=of_scores)
         )
+    slowest = sorted(seconds, key=lambda one: -seconds[one])[:3]
+    corrects = any("discrepancy" in candidate.family for candidate in stacked)
     curve = None
     if learning_curve:
         curve = LearningCurve(
@@ -158,7 +153,7 @@ def stack(
         points[0],
         learning_curve=curve,
         batch=batch,
-        discrepancy=_discrepancy(stacked, data),
+        discrepancy=data.discrepancy() if corrects and data.compares_entries else None,
         probability_of_prior=probability_of_prior(
             data.pairs, data.prior, seed=data.seed
         ),
@@ -166,10 +161,7 @@ def stack(
         provenance={
             "seed": "none, so that a repetition differs" if seed is None else str(seed),
             "seconds": f"{time.perf_counter() - start:.0f}",
-            "longest": ", ".join(
-                f"{name} {seconds[name]:.0f} s"
-                for name in sorted(seconds, key=lambda one: -seconds[one])[:3]
-            ),
+            "longest": ", ".join(f"{name} {seconds[name]:.0f} s" for name in slowest),
             **({"left out": left_out(stacked, x_o)} if candidates is None else {}),
             "simulator calls": f"{rope.num_simulator_calls - calls:,}",
             "finished": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
@@ -186,35 +178,14 @@ def stack(
     return posterior
 
 
-def _numbers_of_folds(num_folds: int, *, curve: bool) -> list[int]:
-    """Return on how many folds versions are trained, all but one first."""
-    most = num_folds - 1
-    smaller = {int(share * num_folds) for share in SMALLER} if curve else set()
-    return [most, *sorted((n for n in smaller if 0 < n < most), reverse=True)]
-
-
-def _discrepancy(
-    candidates: Sequence[Candidate], data: StackData
-) -> DiscrepancyReport | None:
-    """Return what the pairs say about each entry of x, if a candidate uses it."""
-    is_used = any("discrepancy" in candidate.family for candidate in candidates)
-    return data.discrepancy() if is_used and data.compares_entries else None
-
-
 def _compare_batch(data: StackData, x_o: Tensor) -> TwoSampleTest | None:
     """Compare observations with those of the pairs, and warn if they clearly differ.
 
-    Returns:
-        An energy test of the embeddings h(x), with the pairs as the first set, or None
-        if there are too few observations or pairs.
+    The energy test of their embeddings is None if there are too few of them.
     """
-    net = data.embedding_net
-    test = compare_with_pairs(
-        embed(net, data.pairs.x),
-        data.pairs.group.cpu(),
-        embed(net, x_o),
-        headless(data.estimator),
-    )
+    real, batch = (embed(data.embedding_net, x) for x in (data.pairs.x, x_o))
+    density = headless(data.estimator)
+    test = compare_with_pairs(real, data.pairs.group.cpu(), batch, density)
     if test is not None and test.is_different:
         names = data.rope.parameter_names or default_names(data.pairs.theta.shape[-1])
         where = ", ".join(test.parameters(names)) or "no parameter alone"

@@ -1,8 +1,8 @@
 """What holds for every candidate of a stack, also for one that a user has written."""
 
 import copy
-import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 from unittest.mock import patch
 
@@ -14,9 +14,7 @@ from sbi_rope._random import seeded
 from sbi_rope._sbi import embed
 from sbi_rope.data import Nodes, Pairs
 from sbi_rope.density import Density, Flow
-from sbi_rope.ensemble import embedded
 from sbi_rope.finetuning import CalibrationFinetuner, finetune_flow
-from sbi_rope.fit import Training
 from sbi_rope.stacking import (
     Candidate,
     FinetunedCandidate,
@@ -34,7 +32,6 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:Maximum number of epochs"),
 ]
 
-SHORT = Training(training_batch_size=50, max_num_epochs=2)
 ALL = [*CANDIDATES, BOX, UnlabelledCandidate(observed(40))]
 LEARNING = [one for one in ALL if one.name not in ("prior", "NPE")]
 each = pytest.mark.parametrize("candidate", ALL, ids=lambda one: one.name)
@@ -55,25 +52,16 @@ def log_probs(density: Density, n: int = 7) -> Tensor:
 
 def poisoned(data: StackData, rows: Tensor) -> StackData:
     """Return the data with NaN in everything that is known of some pairs."""
-
-    def nan(values: Tensor, value: float = torch.nan) -> Tensor:
-        values = values.clone()
-        values[rows] = value
-        return values
-
-    pairs, label = data.pairs, copy.copy(data.pairs.label)
+    changed, pairs = copy.copy(data), data.pairs
     # NaN would be a parameter that was not measured.
-    object.__setattr__(label, "y", nan(label.y, torch.inf))
-    changed = copy.copy(data)
-    changed.__dict__.pop("has_summaries", None)
-    changed.kept = {}
-    changed.pairs = Pairs(
-        theta=nan(pairs.theta),
-        x=nan(pairs.x),
-        group=pairs.group,
-        weight=nan(pairs.weight),
-        label=label,
+    y = pairs.label.y.index_fill(0, rows, torch.inf)
+    theta, x, weight = (
+        one.index_fill(0, rows, torch.nan)
+        for one in (pairs.theta, pairs.x, pairs.weight)
     )
+    label = replace(pairs.label, y=y)
+    changed.pairs = replace(pairs, theta=theta, x=x, weight=weight, label=label)
+    changed.kept = {}
     return changed
 
 
@@ -118,8 +106,7 @@ def test_it_learns_from_the_rows_that_it_may_see(candidate: Candidate) -> None:
 
 
 @each
-def test_versions_trained_at_once_are_those_trained_alone(candidate: Candidate) -> None:
-    """But for random numbers: here nothing random is left."""
+def test_every_version_has_a_density_of_its_own(candidate: Candidate) -> None:
     data = data_of(rope_of(problem(16, seed=1)))
     versions = [data.without(0), data.every]
     densities = fitted(candidate, data, versions)
@@ -160,18 +147,13 @@ def test_a_single_fold_or_person_is_enough(candidate: Candidate) -> None:
 # --- who is held out ---
 
 
-def recordings() -> tuple[Tensor, Tensor]:
-    """Of nine people, three each, in mixed order."""
-    theta, x = problem(9, seed=4)
-    order = torch.randperm(27)
-    x = x.repeat(3, 1) + 0.1 * torch.randn(27, 3)
-    return theta.repeat(3, 1)[order], x[order]
-
-
 def test_recordings_of_a_person_are_never_both_trained_on_and_held_out(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    data = data_of(rope_of(recordings()))
+    """There are nine people, three recordings of each, in mixed order."""
+    (theta, x), order = problem(9, seed=4), torch.randperm(27)
+    x = x.repeat(3, 1) + 0.1 * torch.randn(27, 3)
+    data = data_of(rope_of((theta.repeat(3, 1)[order], x[order])))
     people = data.pairs.group
     splits: list[tuple[Tensor, Tensor]] = []
     sets: list[Tensor] = []
@@ -239,27 +221,22 @@ def test_pairs_are_embedded_by_tuned_nets_that_have_not_seen_them() -> None:
         assert torch.allclose(z[torch.isin(version, part)], expected, atol=1e-5)
 
 
-def test_fine_tuning_of_a_tuned_candidate_starts_behind_the_net_without_the_part() -> (
-    None
-):
+def test_fine_tuning_starts_behind_the_tuned_net_without_the_held_out_part() -> None:
     data = data_of(rope_of(problem(12, seed=1)))
-    versions = [data.without(0), data.every]
-    seen: list[Flow] = []
+    versions, x = [data.without(0), data.every], data.pairs.x
+    found: list[Tensor] = []
 
     def spied(flow: Flow, *rest: Any, **options: Any) -> Any:
-        seen.append(copy.deepcopy(flow))
+        found.append(flow.embed(x))
         return finetune_flow(flow, *rest, **options)
 
     with quick(), seeded(0), patch.object(candidates, "finetune_flow", spied):
         FinetunedCandidate(space="tuned").fit(data, versions)
-    with quick():
-        nets, x = tuned(data, versions), data.pairs.x
-    expected = [number for rows in versions for number in nets.of(rows, data)]
-    z = seen[0].embed(x)
-    assert z.shape[1] == len(expected) == 3 + 4
-    for column, number in enumerate(expected):
-        own = nets.nets.member(number)(x)
-        assert torch.allclose(z[:, column], own, atol=1e-5)
+        nets = tuned(data, versions)
+    numbers = [number for rows in versions for number in nets.of(rows, data)]
+    expected = torch.stack([nets.nets.member(k)(x) for k in numbers], dim=1)
+    assert expected.shape[1] == 3 + 4
+    assert torch.allclose(found[0], expected, atol=1e-5)
 
 
 # --- losses ---
@@ -273,102 +250,49 @@ def test_pairs_and_simulations_count_half_each_with_rehearsal_and_pairs_by_weigh
 
     estimator = problems.npe_posterior("mdn", "linear").posterior_estimator
     (theta, x), weights = problem(12, seed=1), torch.linspace(0.2, 3.0, 12)
-    losses: list[Tensor] = []
 
     def spied(network: Any, batches: Any, loss: Any, *rest: Any, **options: Any) -> Any:
-        losses.append(torch.stack([loss(*batch).detach() for batch in batches(0)]))
-        losses.append(options["validation_loss"](*options["held_out"]).detach())
-        return []
+        first = torch.stack([loss(*batch).detach() for batch in batches(0)])
+        held_out = options["validation_loss"](*options["held_out"]).detach()
+        return first.mean(dim=0).double(), held_out.double()
 
     monkeypatch.setattr(finetuning, "fit", spied)
+    monkeypatch.setattr(finetuning, "PAIRS_IN_BATCH", 20_000)
     rows = torch.arange(12)
     splits = [(rows[:8], rows[8:]), (rows[3:], rows[:2])]
 
-    def run(**options: Any) -> tuple[Tensor, Tensor]:
-        losses.clear()
-        flow = Flow.of([estimator] * 2)
+    def run(**options: Any) -> Any:
+        flow, labels = Flow.of([estimator] * 2), [Nodes.exact(theta)] * 2
+        options |= {"training": finetuning.FINETUNING, "weights": weights}
         with quick():
-            finetune_flow(
-                flow,
-                [Nodes.exact(theta)] * 2,
-                x,
-                splits,
-                training=finetuning.FINETUNING,
-                weights=weights,
-                **options,
-            )
-        first, held_out = losses
-        return first, held_out
+            return finetune_flow(flow, labels, x, splits, **options)
 
     of_rows = estimator.loss(theta, condition=x).detach()
 
-    def mean(some: Tensor) -> Tensor:
-        return (weights[some] * of_rows[some]).sum() / weights[some].sum()
+    def means(of_splits: Sequence[Tensor]) -> Tensor:
+        weighted = [weights[some] @ of_rows[some] for some in of_splits]
+        total = [weights[some].sum() for some in of_splits]
+        return (torch.stack(weighted) / torch.stack(total)).double()
 
+    train, part = map(means, zip(*splits, strict=True))
     first, held_out = run()
-    train = torch.stack([mean(train) for train, _ in splits]).double()
-    assert torch.allclose(first[0].double(), train, atol=1e-4)
-    expected = torch.stack([mean(part) for _, part in splits]).double()
-    assert torch.allclose(held_out.double(), expected, atol=1e-4)
-    simulations = theta[:1], x[:1]  # the only one
-    of_batches, _ = run(rehearsed=simulations)
-    assert of_batches.shape == (3, 2)
-    with patch("sbi_rope.finetuning.PAIRS_IN_BATCH", 20_000):
-        of_batches, _ = run(rehearsed=simulations)
-    half = 0.5 * train + 0.5 * float(of_rows[0])
-    plain = torch.stack(
-        [(weights[t] * of_rows[t]).mean() / weights[t].mean() for t, _ in splits]
-    ).double()
-    assert torch.allclose(
-        of_batches.mean(0).double(), 0.5 * plain + half - 0.5 * train, atol=0.05
-    )
-
-
-def test_an_observation_is_embedded_once_whatever_its_label_leaves_possible() -> None:
-    theta, x = problem(12, seed=1)
-    rope = rope_of(problem(0, seed=1)).append_calibration(theta, x, theta_std=0.1)
-    data = data_of(rope)
-    flow = Flow.of([data.estimator])
-    nodes = data.nodes(data.every, flow)
-    assert nodes.theta.shape[1] > 10
-    sizes: list[int] = []
-    answer = type(flow.nets).answer
-
-    def counted(self: Any, question: Any, *rows: Tensor) -> Tensor:
-        if question is embedded:
-            sizes.append(len(rows[0]))
-        return answer(self, question, *rows)
-
-    histories: list[Any] = []
-    with patch.object(type(flow.nets), "answer", counted), quick():
-        split = [(data.every[:8], data.every[8:])]
-        histories = finetune_flow(
-            flow, [nodes], data.pairs.x, split, training=candidates.FINETUNING
-        )
-    assert {*sizes} == {8, 4}
-    log_q = flow.log_prob(nodes.theta.movedim(1, 0), data.pairs.x).T
-    assert math.isfinite(histories[0].kept_validation_loss)
-    assert nodes.log_mean(log_q).isfinite().all()
+    assert torch.allclose(first, train, atol=1e-4)
+    assert torch.allclose(held_out, part, atol=1e-4)
+    first, _ = run(rehearsed=(theta[:1], x[:1]))  # the only simulation
+    assert torch.allclose(first, 0.5 * train + 0.5 * float(of_rows[0]), atol=0.05)
 
 
 def test_a_version_is_corrected_by_the_discrepancy_of_its_rows() -> None:
     """Pairs of two kinds, each shifted in its own way."""
-    theta, x = problem(16, seed=1)
-    data = data_of(rope_of((theta, x)), num_folds=2)
-    moved = data.pairs.x.clone()
-    moved[data.folds[0]] += 2.0
-    object.__setattr__(data.pairs, "x", moved)
+    data = data_of(rope_of(problem(16, seed=1)), num_folds=2)
+    moved = data.pairs.x.index_add(0, data.folds[0], torch.full((8, 3), 2.0))
+    data.pairs = replace(data.pairs, x=moved)
     found = corrected(data, data.folds, "input", learn_prior=False).flow
-    shift = embed(data.embedding_net, moved).std()
-    assert float(shift) > 0
     theta, x = problem(200, seed=9)
-    with torch.no_grad():
-        own = [
-            float(found[[k]].log_prob(theta[None], x + 2.0 * (k == 0)).mean())
-            for k in (0, 1)
-        ]
-        others = [
-            float(found[[k]].log_prob(theta[None], x + 2.0 * (k == 1)).mean())
-            for k in (0, 1)
-        ]
-    assert all(a > b + 0.3 for a, b in zip(own, others, strict=True))
+    for version in (0, 1):
+        with torch.no_grad():
+            own, other = (
+                float(found[[version]].log_prob(theta[None], x + 2.0 * kind).mean())
+                for kind in (version == 0, version == 1)
+            )
+        assert own > other + 0.3

@@ -128,9 +128,7 @@ CALLS: dict[str, Call] = {
     "diagnose": lambda x_o=X_O: diagnose(trained(), x_o, num_folds=None),
     **of_posterior("MixturePosterior", coupled),
     **of_posterior("StackedPosterior", stacked),
-    "lpp": lambda theta=THETA, x=X: metrics.lpp(stacked(), theta, x),
     "evaluate": lambda theta=THETA, x=X: metrics.evaluate(stacked(), theta, x),
-    "acauc_of": lambda levels=LEVELS: metrics.acauc_of(levels).value,
     "method.append_simulations": lambda theta=THETA_S, x=X_S: (
         DiscrepancyNPE(PRIOR).append_simulations(theta, x)._data.simulations[1]
     ),
@@ -178,9 +176,6 @@ def shape(*sizes: int) -> Callable[[Tensor], bool]:
 MEANS: dict[str, Callable[[Any], bool]] = {
     # A parameter that was not measured is imputed.
     "RoPE.append_calibration(theta: NaN)": finite,
-    "acauc_of(levels: width)": finite,
-    # A parameter that is not known.
-    "acauc_of(levels: NaN)": finite,
 }
 for _name in CALLS:
     if "log_prob" in _name:  # one of the parameters is impossible

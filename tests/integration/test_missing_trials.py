@@ -38,7 +38,7 @@ def rope() -> RoPE:
 def is_finite(posterior: object, theta: Tensor, x: Tensor) -> bool:
     scores = evaluate(posterior, theta, x, num_samples=20)
     samples = draw_samples(posterior, x, num_samples=5)
-    return bool(scores.lpp.log_probs.isfinite().all() and samples.isfinite().all())
+    return bool(scores.log_prob.isfinite().all() and samples.isfinite().all())
 
 
 def test_rope_repairs_a_posterior_of_trials_some_of_which_are_missing() -> None:

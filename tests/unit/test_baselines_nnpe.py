@@ -14,7 +14,7 @@ from torch.distributions import Independent, Normal
 from sbi_rope._sbi import embedding_of, estimator_of
 from sbi_rope.baselines import NNPE, PlainNPE, SpikeAndSlab, Training
 from sbi_rope.baselines.statistics import SoftClip
-from sbi_rope.metrics import lpp
+from sbi_rope.metrics import evaluate
 from tests import problems
 
 QUIET: dict[str, Any] = {"seed": 0, "show_progress_bars": False}
@@ -69,7 +69,9 @@ def test_it_costs_little_where_the_simulator_is_right_and_gains_much_where_not(
 ) -> None:
     theta = PRIOR.sample(torch.Size((500,)))
     scores = {
-        (offset, name): lpp(posterior, theta, simulate(theta, offset)).mean
+        (offset, name): evaluate(
+            posterior, theta, simulate(theta, offset), num_samples=20
+        ).lpp.mean
         for offset in (0.0, 5.0)
         for name, posterior in (
             ("npe", trained_npe()),

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,28 +10,23 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from sbi_rope.discrepancy import DiscrepancyModel
-from sbi_rope.discrepancy.regression import (
-    Conditional,
-    GroupErrors,
-    Regressions,
-    independent_pairs,
-)
-from sbi_rope.metrics.calibration import acauc_of
+from sbi_rope.discrepancy import Discrepancy, DiscrepancyModel
+from sbi_rope.discrepancy.regression import GroupErrors, Regressions, independent_pairs
 
 # Settings of the hyper-parameters k, s and the strength of the error's prior.
 SETTINGS = [(0.5, 0.2, 1.0), (3.0, 0.6, 4.0), (30.0, 0.1, 20.0)]
 DRAWS = 40_000
 
 
-def at(k: float, s: float, strength: float, *, none: float = 0.0) -> DiscrepancyModel:
+def at(k: float, s: float, strength: float) -> DiscrepancyModel:
     """The model at one setting of its hyper-parameters."""
     return DiscrepancyModel(
-        gain_precisions=(k,),
-        error_scales=(s,),
-        degrees_of_freedom=(strength,),
-        probability_of_none=none,
+        gain_precisions=(k,), error_scales=(s,), degrees_of_freedom=(strength,)
     )
+
+
+def certainly_off(model: DiscrepancyModel) -> DiscrepancyModel:
+    return replace(model, probability_of_none=0.0)
 
 
 def pairs(n: int, width: int, *, error: float = 0.3) -> tuple[Tensor, Tensor]:
@@ -48,8 +42,7 @@ def no_noise(width: int) -> Tensor:
 
 
 def without_rounding(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("model", "regression"):
-        monkeypatch.setattr(f"sbi_rope.discrepancy.{module}.SMALLEST_NOISE", 0.0)
+    monkeypatch.setattr("sbi_rope.discrepancy.posterior.SMALLEST_NOISE", 0.0)
 
 
 def updated(
@@ -93,7 +86,8 @@ def test_evidence_and_draws_are_those_of_one_update_after_the_other(
     for width in (1, 2, 4):
         z, mean = pairs(9, width)
         for setting in SETTINGS:
-            discrepancy = at(*setting).fit(z, mean, 1e-12 * torch.eye(width))
+            model = certainly_off(at(*setting))
+            discrepancy = model.fit(z, mean, 1e-12 * torch.eye(width))
             evidence, coefficients, rows, sigma = updated(z, mean, setting)
             assert discrepancy.log_evidence == pytest.approx(evidence, abs=1e-8)
             draws = discrepancy.sample(DRAWS, smallest_error=0.0, seed=0)
@@ -103,9 +97,8 @@ def test_evidence_and_draws_are_those_of_one_update_after_the_other(
             assert (error < 0.03 * std).all(), setting
             assert drawn.std(dim=0).numpy() == pytest.approx(std, rel=0.04), setting
             total = (draws.error_factor @ draws.error_factor.mT).mean(dim=0)
-            assert total.numpy() == pytest.approx(
-                sigma, rel=0.04, abs=0.04 * np.diag(sigma).max()
-            ), setting
+            error = np.abs(total.numpy() - sigma)
+            assert (error < 0.04 * np.diag(sigma).max()).all(), setting
 
 
 def test_the_shape_of_the_error_is_averaged_over_by_evidence(
@@ -153,8 +146,7 @@ def test_a_precise_entry_beside_imprecise_ones_is_not_blurred() -> None:
         z = (new - (shrunk * rest[..., 0]).sum(dim=2)) / std_of_theta
         cdf = (weight * torch.special.ndtr(z)).sum(dim=1)
         levels.append((2 * cdf - 1).abs()[:, None])
-    found = acauc_of(torch.cat(levels), None)
-    assert abs(found.value) <= 0.06, found
+    assert abs(float(torch.cat(levels).mean()) - 0.5) <= 0.06
 
 
 def test_the_evidence_of_a_simulator_that_is_right_is_a_normal_density(
@@ -173,23 +165,6 @@ def test_the_evidence_of_a_simulator_that_is_right_is_a_normal_density(
     other = 0.8 * math.exp(discrepancy.log_evidence - sum(densities))
     expected = 0.2 / (0.2 + other)
     assert discrepancy.probability_of_none == pytest.approx(expected, rel=1e-8)
-
-
-def test_the_evidence_of_the_grid_is_the_average_of_its_settings() -> None:
-    z, mean = pairs(5, 2)
-    grid = DiscrepancyModel(
-        gain_precisions=(0.3, 3.0), error_scales=(0.1, 0.4), degrees_of_freedom=(2.0,)
-    )
-    whole = grid.fit(z, mean, no_noise(2))
-    single = [
-        at(k, s, 2.0).fit(z, mean, no_noise(2)).log_evidence
-        for k in (0.3, 3.0)
-        for s in (0.1, 0.4)
-    ]
-    evidence = torch.tensor(single, dtype=torch.double)
-    expected = float(evidence.logsumexp(0)) - math.log(4)
-    assert whole.log_evidence == pytest.approx(expected, abs=1e-9)
-    assert torch.allclose(whole.shares, evidence.softmax(0), atol=1e-9)
 
 
 def test_the_evidence_of_correlated_errors_is_a_matrix_t_density(
@@ -224,10 +199,9 @@ def test_the_evidence_of_correlated_errors_is_a_matrix_t_density(
 
 
 def std_of_offset(z: Tensor, mean: Tensor, **options: Tensor) -> float:
-    discrepancy = DiscrepancyModel(probability_of_none=0.0).fit(
-        z, mean, no_noise(z.shape[1]), **options
-    )
-    return float(discrepancy.sample(2000, seed=0).offset.std(dim=0).mean())
+    model = certainly_off(DiscrepancyModel())
+    found = model.fit(z, mean, no_noise(z.shape[1]), **options)
+    return float(found.sample(2000, seed=0).offset.std(dim=0).mean())
 
 
 def test_a_group_counts_as_many_pairs_as_its_errors_are_independent() -> None:
@@ -245,14 +219,6 @@ def test_a_group_counts_as_many_pairs_as_its_errors_are_independent() -> None:
     assert once == pytest.approx(alone, rel=0.15)
 
 
-def counted(groups: Tensor, error: Tensor, **options: Tensor) -> float:
-    """How many independent pairs those with these errors count as."""
-    mean = torch.randn(int(groups.max()) + 1, error.shape[1]).double()[groups]
-    noise = no_noise(error.shape[1])
-    found = DiscrepancyModel().fit(mean + error, mean, noise, groups=groups, **options)
-    return found.num_independent
-
-
 def test_sets_of_means_have_each_the_posterior_that_they_have_alone() -> None:
     z, mean = pairs(9, 2)
     means = mean + 0.3 * torch.randn(4, 9, 2)
@@ -263,20 +229,19 @@ def test_sets_of_means_have_each_the_posterior_that_they_have_alone() -> None:
     model = DiscrepancyModel(gain_precisions=(0.1, 1.0), error_scales=(0.1, 0.4))
     noise, once = 0.1 * torch.eye(2).double(), torch.rand(9).double()
 
-    def conditional(some: slice) -> Conditional:
-        return model._conditional(z, means[some], noise, weights[some], once)
+    def posteriors(some: slice) -> list[Discrepancy]:
+        given = {"z": z, "noise": noise, "once": once}
+        return model._conditional(means[some], weights[some], **given).posteriors()
 
-    for number, one in enumerate(conditional(slice(None)).posteriors()):
-        [alone] = conditional(slice(number, number + 1)).posteriors()
+    for number, one in enumerate(posteriors(slice(None))):
+        [alone] = posteriors(slice(number, number + 1))
         assert torch.allclose(one.shares, alone.shares)
         assert one.num_independent == pytest.approx(float(weights[number].sum()))
         for name in ("probability_of_none", "log_evidence", "log_evidence_of_none"):
             assert getattr(one, name) == pytest.approx(getattr(alone, name))
         for term, other in zip(one.terms, alone.terms, strict=True):
-            for part, same in zip(
-                vars(term).values(), vars(other).values(), strict=True
-            ):
-                assert torch.allclose(part.abs(), same.abs())  # signs of eigenvectors
+            for name, part in vars(term).items():  # signs of eigenvectors may differ
+                assert torch.allclose(part.abs(), getattr(other, name).abs())
 
 
 def test_many_recordings_that_are_hardly_correlated_count_as_many_pairs() -> None:
@@ -287,10 +252,11 @@ def test_many_recordings_that_are_hardly_correlated_count_as_many_pairs() -> Non
         truth = 2000 / (1 + 199 * correlation)
         # Ten specimens say little about a correlation of a few hundredths. With a grid
         # that has none between 0 and .2, the count is too small by a factor of seven.
-        assert truth / 3 < counted(groups, error) < 3 * truth
+        mean = torch.randn(10, 2).double()[groups]
+        found = DiscrepancyModel().fit(mean + error, mean, no_noise(2), groups=groups)
+        assert truth / 3 < found.num_independent < 3 * truth
 
 
-@pytest.mark.medium
 def test_weights_that_differ_within_a_group_count_by_their_effective_number() -> None:
     # The variance of their mean is that of correlated errors, summed by hand.
     groups, weights, rho = torch.tensor([0, 0, 1]), torch.tensor([2.0, 1.0, 3.0]), 0.5
@@ -298,10 +264,6 @@ def test_weights_that_differ_within_a_group_count_by_their_effective_number() ->
     found = independent_pairs(groups, rho, weights)
     assert float(found[:2].sum()) == pytest.approx(1 / of_group)
     assert float(found[2]) == 3.0
-    # All pairs are of one specimen, and labels leave two parameters possible.
-    groups, mean = torch.zeros(30).long(), torch.randn(30, 2, 2).double()
-    fitted = DiscrepancyModel().fit(mean[:, 0], mean, no_noise(2), groups=groups)
-    assert 1 <= fitted.num_independent <= 30
 
 
 GRID = DiscrepancyModel(
@@ -311,17 +273,11 @@ GRID = DiscrepancyModel(
 )
 
 
-def from_the_prior(n: int, width: int) -> tuple[dict[str, Any], Tensor, Tensor]:
-    """A, b and Sigma from the prior of GRID, by SciPy, and pairs that follow them."""
+def from_the_prior(n: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Sigma and (A, b) from the prior of GRID by SciPy, and pairs that follow them."""
     pick = np.random.default_rng(int(torch.randint(2**31, ())))
-    k, s, strength = (
-        float(pick.choice(values))
-        for values in (
-            GRID.gain_precisions,
-            GRID.error_scales,
-            GRID.degrees_of_freedom,
-        )
-    )
+    grid = GRID.gain_precisions, GRID.error_scales, GRID.degrees_of_freedom
+    k, s, strength = (float(pick.choice(values)) for values in grid)
     scale = strength * s**2 * np.eye(width)
     sigma = stats.invwishart.rvs(strength + width + 1, scale, random_state=pick)
     coefficients = stats.matrix_normal.rvs(
@@ -333,43 +289,28 @@ def from_the_prior(n: int, width: int) -> tuple[dict[str, Any], Tensor, Tensor]:
     mean = torch.randn(n, width, dtype=torch.double)
     design = np.hstack([mean.numpy(), np.ones((n, 1))])
     z = design @ coefficients.T + pick.multivariate_normal(np.zeros(width), sigma, n)
-    truth = {"gain": coefficients[:, :-1], "offset": coefficients[:, -1], "s": sigma}
+    truth = torch.as_tensor(np.hstack([sigma, coefficients]))
     return truth, torch.as_tensor(z), mean
 
 
 @pytest.mark.slow
 def test_draws_are_calibrated_over_repetitions_from_the_prior() -> None:
-    num_repetitions, num_draws, width = 300, 99, 2
-    ranks: list[list[float]] = []
-    noise = 0.01 * torch.eye(width).double()
-    for repetition in range(num_repetitions):
-        truth, z, mean = from_the_prior(8, width)
-        model = replace(GRID, probability_of_none=0.0)
-        discrepancy = model.fit(z, mean, noise)
-        draws = discrepancy.sample(num_draws, smallest_error=0.0, seed=repetition)
+    noise, ranks = 0.01 * torch.eye(2).double(), []
+
+    def compared(values: Tensor) -> Tensor:
+        """Some entries of (Sigma, A, b), and the determinant of A."""
+        det = torch.linalg.det(values[..., 2:4])[..., None]
+        return torch.cat([values[..., 0, :4], values[..., 1, 4:], det], dim=-1)
+
+    for repetition in range(300):
+        truth, z, mean = from_the_prior(8, 2)
+        discrepancy = certainly_off(GRID).fit(z, mean, noise)
+        draws = discrepancy.sample(99, smallest_error=0.0, seed=repetition)
         total = draws.error_factor @ draws.error_factor.mT
         total = total + draws.gain @ discrepancy.noise @ draws.gain.mT
-        drawn = [
-            draws.gain[:, 0, 0],
-            draws.gain[:, 0, 1],
-            draws.offset[:, 1],
-            torch.linalg.det(draws.gain),
-            total[:, 0, 0],
-            total[:, 0, 1],
-        ]
-        gain, sigma = truth["gain"], truth["s"]
-        true = [
-            gain[0, 0],
-            gain[0, 1],
-            truth["offset"][1],
-            np.linalg.det(gain),
-            sigma[0, 0],
-            sigma[0, 1],
-        ]
-        ranks.append(
-            [float((d < t).double().mean()) for d, t in zip(drawn, true, strict=True)]
-        )
-    for column in torch.tensor(ranks).T:
+        drawn = torch.cat([total, draws.gain, draws.offset[..., None]], dim=2)
+        ranks.append((compared(drawn) < compared(truth)).double().mean(dim=0))
+    for column in torch.stack(ranks).T:
         counts = torch.histc(column, bins=10, min=0.0, max=1.0).numpy()
         assert stats.chisquare(counts).pvalue > 1e-3, counts
 
@@ -387,11 +328,8 @@ def test_a_simulator_that_is_right_is_found_right_and_another_is_not() -> None:
 
 def test_some_draws_correct_nothing() -> None:
     z, mean = pairs(30, 2, error=0.1)
-    noise = 0.0025 * torch.eye(2).double()
-    discrepancy = replace(
-        DiscrepancyModel().fit(z, mean, noise), probability_of_none=0.3
-    )
-    draws = discrepancy.sample(5000, seed=0)
+    found = DiscrepancyModel().fit(z, mean, 0.0025 * torch.eye(2).double())
+    draws = replace(found, probability_of_none=0.3).sample(5000, seed=0)
     none = (draws.error_factor == 0).flatten(1).all(dim=1)
     assert float(none.double().mean()) == pytest.approx(0.3, abs=0.02)
     assert (draws.gain[none] == torch.eye(2)).all()
@@ -400,10 +338,7 @@ def test_some_draws_correct_nothing() -> None:
 
 
 def test_the_noise_that_the_simulator_has_made_is_taken_off_times_the_gain() -> None:
-    z, mean = pairs(30, 2, error=1.0)
-
-    model = replace(GRID, probability_of_none=0.0)
-    fitted = model.fit(z, mean, no_noise(2))
+    fitted = certainly_off(GRID).fit(*pairs(30, 2, error=1.0), no_noise(2))
 
     def total(noise: Tensor) -> Tensor:
         discrepancy = replace(fitted, noise=noise.double())
@@ -417,12 +352,8 @@ def test_the_noise_that_the_simulator_has_made_is_taken_off_times_the_gain() -> 
 
 
 def test_simulations_are_corrected_by_gain_offset_and_error() -> None:
-    z, mean = pairs(40, 2)
-    draws = (
-        DiscrepancyModel(probability_of_none=0.0)
-        .fit(z, mean, no_noise(2))
-        .sample(2000, seed=0)
-    )
+    found = certainly_off(DiscrepancyModel()).fit(*pairs(40, 2), no_noise(2))
+    draws = found.sample(2000, seed=0)
     z_s = torch.tensor([1.0, -2.0]).expand(100_000, 2)
     corrected = draws.correct(z_s)
     moved = draws.gain @ z_s[0].double() + draws.offset
@@ -442,37 +373,25 @@ def test_a_draw_can_serve_a_block_of_simulations() -> None:
     assert torch.allclose(one_by_one[0], of_first)
 
 
-def collapsed(n: int = 10) -> Tensor:
-    """One variable three times."""
-    return torch.randn(n, 1).repeat(1, 3)
-
-
-def far_away(scale: float) -> tuple[Tensor, Tensor]:
-    mean = torch.randn(10, 3)
-    z = mean.clone()
-    z[0] += scale
-    return z, mean
-
-
 def test_draws_are_finite_for_extreme_and_degenerate_pairs() -> None:
+    some = torch.randn(10, 1)
     cases = {
-        "an outlier": far_away(1e10),
-        "collinear": (collapsed(), collapsed()),
+        "an outlier": (torch.eye(10)[:, :3] * 1e10, torch.randn(10, 3)),
+        "collinear": (some.repeat(1, 3), some.repeat(1, 3)),
         "one point": (torch.ones(10, 3), torch.ones(10, 3)),
         "two equal pairs": (torch.ones(2, 3), torch.zeros(2, 3)),
         "one pair": (torch.randn(1, 3), torch.randn(1, 3)),
         "more entries than pairs": (torch.randn(10, 20), torch.randn(10, 20)),
     }
-    model = DiscrepancyModel(probability_of_none=0.0)
+    model = certainly_off(DiscrepancyModel())
     for case, (z, mean) in cases.items():
         for noise in (0.0, 0.01):
             covariance = noise * torch.ones(z.shape[1], z.shape[1])
             discrepancy = model.fit(z, mean, covariance)
             draws = discrepancy.sample(50, seed=0)
             corrected = draws.correct(torch.randn(20, z.shape[1]))
-            for value in (draws.gain, draws.offset, draws.error_factor, corrected):
-                assert value.dtype == torch.double, case
-                assert value.isfinite().all(), case
+            assert corrected.dtype == torch.double, case
+            assert corrected.isfinite().all(), case
             assert math.isfinite(discrepancy.log_evidence), case
 
 
@@ -505,8 +424,7 @@ def test_imputed_means_lead_to_the_posterior_of_quadrature() -> None:
     )
     shares = torch.softmax(log_density, dim=0)
 
-    model = replace(at(k, s, strength), probability_of_none=0.0)
-    noise = torch.tensor([[1e-8]])
+    model, noise = certainly_off(at(k, s, strength)), torch.tensor([[1e-8]])
     fits = [model.fit(z, possible, noise, seed=seed) for seed in range(2)]
     draws = [one.sample(4000, smallest_error=0.0, seed=0) for one in fits]
     for expected, found in (

@@ -50,10 +50,8 @@ def test_ten_pairs_refute_a_simulator_that_all_discrepancies_are_worse_than() ->
     # Rotated, so that no entry by itself is more precise than the others.
     turn, _ = torch.linalg.qr(torch.randn(WIDTH, WIDTH).double())
     covariance = turn @ moments.covariance @ turn.T
-    z, moments = (
-        z @ turn.T,
-        Moments(means=moments.means @ turn.T, covariance=covariance),
-    )
+    moments = Moments(means=moments.means @ turn.T, covariance=covariance)
+    z = z @ turn.T
     evidence = DiscrepancyModel().fit(z, moments.mean, moments.covariance.mean(dim=0))
     assert evidence.probability_of_none > 0.99
     torch.manual_seed(0)

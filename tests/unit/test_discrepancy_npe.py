@@ -1,6 +1,5 @@
 """NPE on corrected simulations as a method: what it takes, returns and refuses."""
 
-from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
@@ -62,30 +61,17 @@ def trained(posterior: Any = None, **options: Any) -> DiscrepancyNPE:
     return chosen.append_calibration(*labelled()).train(**QUIET)
 
 
-def log_probs(posterior: Any, n: int = 5) -> Tensor:
-    with torch.random.fork_rng():
-        torch.manual_seed(3)
-        theta, x = simulations(n)
+def log_probs(posterior: Any, x: Tensor, theta: Tensor | None = None) -> Tensor:
+    theta = torch.zeros(len(x), 2) if theta is None else theta
     return posterior.log_prob_batched(theta[None], x, norm_posterior=False)[0]
 
 
-def sources() -> dict[str, Callable[..., DiscrepancyNPE]]:
-    """The ways to get simulations and an NPE."""
-
-    def scratch(space: str) -> DiscrepancyNPE:
-        builder = posterior_nn("maf", hidden_features=10, num_transforms=1)
-        options = {"npe_training": SHORT, "space": space, **SMALL}
-        made = DiscrepancyNPE(problems.box(2), builder, **options)
-        return made.append_simulations(*simulations())
-
-    return {
-        "simulator": lambda space: method(space=space),
-        "simulations": lambda space: method(space=space, simulations=simulations()),
-        "both": lambda space: method(
-            space=space, simulations=simulations(), simulator=problems.simulate
-        ),
-        "scratch": scratch,
-    }
+def scratch(space: str) -> DiscrepancyNPE:
+    """One that has stored simulations only, and trains NPE itself."""
+    builder = posterior_nn("maf", hidden_features=10, num_transforms=1)
+    options = {"npe_training": SHORT, "space": space, **SMALL}
+    made = DiscrepancyNPE(problems.box(2), builder, **options)
+    return made.append_simulations(*simulations())
 
 
 @pytest.mark.medium
@@ -93,19 +79,26 @@ def sources() -> dict[str, Callable[..., DiscrepancyNPE]]:
 @pytest.mark.parametrize("space", SPACES)
 def test_every_source_of_simulations_gives_a_posterior_of_sbi(space: str) -> None:
     expected = MixturePosterior if space == "tuned" else DirectPosterior
-    x = labelled(4)[1]
-    for name, source in sources().items():
-        made = source(space).append_calibration(*labelled()).train(**QUIET)
+    x, stored = labelled(4)[1], simulations()
+    for name, made in {
+        "simulator": method(space=space),
+        "simulations": method(space=space, simulations=stored),
+        "both": method(space=space, simulations=stored, simulator=problems.simulate),
+        "scratch": scratch(space),
+    }.items():
+        made.append_calibration(*labelled()).train(**QUIET)
         posterior = made.build_posterior()
         assert isinstance(posterior, expected), name
         samples = posterior.sample_batched((7,), x, show_progress_bars=False)
         assert samples.shape == (7, 4, 2), name
         assert problems.box(2).support.check(samples).all(), name
-        found = log_probs(posterior)
+        found = log_probs(posterior, x)
         assert found.isfinite().all(), name
         assert len(made.history.training_loss) >= 4, name
         assert made.discrepancy.num_pairs == 12, name
-        assert not torch.equal(found, log_probs(problems.npe_posterior())), name
+        assert not torch.equal(found, log_probs(problems.npe_posterior(), x)), name
+    with pytest.raises(NotReadyError, match=r"Call `train\(\)` first"):
+        _ = made.append_calibration(*labelled()).discrepancy
 
 
 @pytest.mark.slow
@@ -148,18 +141,6 @@ def test_correcting_an_embedding_leaves_its_net_and_correcting_x_does_not() -> N
         assert torch.equal(*embedded) is same, space
 
 
-@pytest.mark.medium
-def test_discrepancy_and_history_are_those_of_the_last_training() -> None:
-    made = method().append_calibration(*labelled()).train(**QUIET)
-    assert made.discrepancy.num_pairs == 12
-    made.append_calibration(*labelled(3))
-    with pytest.raises(NotReadyError, match=r"Call `train\(\)` first"):
-        _ = made.discrepancy
-    assert made.train(**QUIET).discrepancy.num_pairs == 15
-    again = method(num_steps=45).append_calibration(*labelled()).train(**QUIET)
-    assert len(again.history.training_loss) >= 45
-
-
 @pytest.mark.slow
 def test_learned_parameters_move_the_posterior_to_those_of_the_pairs() -> None:
     theta = problems.box(2).sample((2000,))
@@ -167,32 +148,26 @@ def test_learned_parameters_move_the_posterior_to_those_of_the_pairs() -> None:
     x = problems.simulate(theta) + 3 * torch.randn(100, 3)  # hardly informative
     means = []
     for learn_prior in (False, True):
-        made = method(
-            learn_prior=learn_prior,
-            num_steps=1000,
-            num_simulations=2000,
-        )
-        made.append_calibration(theta, x).train(**QUIET)
-        samples = made.build_posterior().sample_batched(
-            (50,), x[:20], show_progress_bars=False
-        )
+        options = {"num_steps": 1000, "num_simulations": 2000}
+        made = method(learn_prior=learn_prior, **options)
+        posterior = made.append_calibration(theta, x).train(**QUIET).build_posterior()
+        samples = posterior.sample_batched((50,), x[:20], show_progress_bars=False)
         means.append(float(samples[..., 0].mean()))
     assert means[0] < 0.3
     assert 0.6 < means[1] < 0.9
 
 
-def constant(theta: Tensor) -> Tensor:
-    """One reading never varies in simulations."""
-    return torch.cat([problems.simulate(theta), torch.full((len(theta), 1), 2.0)], 1)
+@pytest.mark.parametrize("space", ["embedding", "input"])
+def test_entries_that_are_constant_in_simulations_do_not_change_the_posterior(
+    space: Any,
+) -> None:
+    """One reading is always 2 in simulations, and varies a lot in reality."""
 
+    def constant(theta: Tensor) -> Tensor:
+        return torch.cat(
+            [problems.simulate(theta), torch.full_like(theta[:, :1], 2)], 1
+        )
 
-def far_labelled() -> tuple[Tensor, Tensor]:
-    """In reality this reading varies a lot."""
-    theta, x = labelled()
-    return theta, torch.cat([x, 100 * torch.randn(12, 1)], dim=1)
-
-
-def with_a_constant_reading(space: Any) -> DiscrepancyNPE:
     builder = posterior_nn(
         "maf",
         z_score_x="none",
@@ -200,69 +175,43 @@ def with_a_constant_reading(space: Any) -> DiscrepancyNPE:
         num_transforms=1,
         embedding_net=nn.Linear(4, 3) if space == "input" else nn.Identity(),
     )
-    theta = problems.box(2).sample((300,))
-    made = DiscrepancyNPE(
-        problems.box(2),
-        builder,
-        simulator=constant,
-        space=space,
-        npe_training=SHORT,
-        **SMALL,
-    )
-    return made.append_simulations(theta, constant(theta))
-
-
-def test_entries_that_are_constant_in_simulations_do_not_change_the_posterior() -> None:
-    theta, x = far_labelled()
-    other = x.clone()
+    options = {"npe_training": SHORT, "space": space, **SMALL}
+    made = DiscrepancyNPE(problems.box(2), builder, simulator=constant, **options)
+    theta, x = labelled()
+    x = torch.cat([x, 100 * torch.randn(12, 1)], dim=1)
+    stored = problems.box(2).sample((300,))
+    made.append_simulations(stored, constant(stored)).append_calibration(theta, x)
+    posterior, other = made.train(**QUIET).build_posterior(), x.clone()
     other[:, 3] = -1e4
-    for space in ("embedding", "input"):
-        made = with_a_constant_reading(space).append_calibration(theta, x)
-        posterior = made.train(**QUIET).build_posterior()
-        densities = [
-            posterior.log_prob_batched(theta[None], some, norm_posterior=False)
-            for some in (x, other)
-        ]
-        assert torch.equal(*densities), space
+    expected = log_probs(posterior, x, theta)
+    assert torch.equal(log_probs(posterior, other, theta), expected)
 
 
-def test_only_simulations_with_a_probability_are_drawn(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_only_simulations_with_a_probability_are_drawn() -> None:
     seen, losses = [], Flow.losses
 
     def recorded(self: Flow, theta: Tensor, x: Tensor) -> Tensor:
         seen.append((theta.flatten(0, 1), x.flatten(0, 1)))
         return losses(self, theta, x)
 
-    monkeypatch.setattr(Flow, "losses", recorded)
     theta, x = simulations()
     probabilities = torch.zeros(300).index_fill(0, torch.tensor([7, 9]), 0.5)
-    none = fit_discrepancy(
-        x,
-        Moments(
-            means=x.double()[:, None],
-            covariance=torch.eye(3).double().expand(300, 3, 3),
-        ),
-        Standardisation(x.double()),
-        DiscrepancyModel(probability_of_none=1.0),
-    )
-    correct_flow(
-        estimator_of(problems.npe_posterior()),
-        (theta, x),
-        [none],
-        space="input",
-        probabilities=[probabilities],
-        num_steps=2,
-    )
+    noise = torch.eye(3).double().expand(300, 3, 3)
+    moments = Moments(means=x.double()[:, None], covariance=noise)
+    right = DiscrepancyModel(probability_of_none=1.0)
+    none = fit_discrepancy(x, moments, Standardisation(x.double()), right)
+    estimator = estimator_of(problems.npe_posterior())
+    with patch.object(Flow, "losses", recorded):
+        correct_flow(
+            estimator, (theta, x), [(none, probabilities)], space="input", num_steps=2
+        )
     drawn, conditions = (torch.cat(parts) for parts in zip(*seen, strict=True))
     first = (drawn == theta[7]).all(dim=1)
     assert (first | (drawn == theta[9]).all(dim=1)).all()
     assert 0.4 < float(first.double().mean()) < 0.6
     # Without a correction they are themselves, in the units of x.
-    assert torch.allclose(
-        conditions[first], x[7].expand(int(first.sum()), 3), atol=1e-5
-    )
+    expected = x[7].expand(int(first.sum()), 3)
+    assert torch.allclose(conditions[first], expected, atol=1e-5)
 
 
 def test_pairs_that_cannot_be_corrected_are_refused() -> None:

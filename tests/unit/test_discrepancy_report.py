@@ -61,7 +61,6 @@ def test_a_planted_discrepancy_is_found_in_units_of_x_and_no_other() -> None:
     assert found.summaries[0].name == "shade"
     shade = found["shade"]
     assert shade.is_off
-    assert shade.probability_of_none < 1e-6
     for true, interval, width in [
         (GAIN, shade.gain, 0.4),
         (SHIFT, shade.shift, 0.2),
@@ -76,12 +75,14 @@ def test_a_planted_discrepancy_is_found_in_units_of_x_and_no_other() -> None:
         assert not found[name].is_off
         assert inside(1.0, found[name].gain)
         assert inside(0.0, found[name].shift)
-        assert found[name].outliers == ()
     text = str(found)
     assert "What 200 calibration pairs say" in text
     clean = next(line for line in text.split("\n") if "no sign of discrep" in line)
     assert set(clean.split(": ")[1].split(", ")) == {"light", "heat", "dust"}
-    assert "do not fit" not in text
+    assert found.notes == []
+    rows = found.as_rows()
+    assert [row["summary"] for row in rows] == [s.name for s in found.summaries]
+    assert rows[0]["shift_low"] == shade.shift.low
 
 
 @pytest.mark.slow
@@ -91,8 +92,7 @@ def test_intervals_of_95_percent_hold_the_truth_in_95_percent_of_repetitions() -
     model = DiscrepancyModel(
         gain_precisions=(3.0,), error_scales=(0.4,), degrees_of_freedom=(4.0,)
     )
-    noise, mean_x, spread = 0.01, 7.0, 3.0
-    prior = mean_x + spread * torch.randn(20_000, 1).double()
+    noise, prior = 0.01, 7.0 + 3.0 * torch.randn(20_000, 1).double()
     centre, scale = float(prior.mean()), float(prior.std())
     for repetition in range(num_repetitions):
         sigma = stats.invgamma.rvs(3.0, scale=2 * 0.16, random_state=repetition)
@@ -100,23 +100,14 @@ def test_intervals_of_95_percent_hold_the_truth_in_95_percent_of_repetitions() -
         shift = sigma**0.5 * float(torch.randn(()))
         mean = torch.randn(n, 1).double()
         z = gain * mean + shift + sigma**0.5 * torch.randn(n, 1)
-        found = report_discrepancy(
-            centre + scale * z,
-            Moments(
-                means=(centre + scale * mean)[:, None],
-                covariance=torch.full((n, 1, 1), noise * scale**2).double(),
-            ),
-            prior,
-            model=model,
-        )["x[0]"]
+        covariance = torch.full((n, 1, 1), noise * scale**2).double()
+        moments = Moments(means=(centre + scale * mean)[:, None], covariance=covariance)
+        x = centre + scale * z
+        found = report_discrepancy(x, moments, prior, model=model)["x[0]"]
         error = max(sigma - gain**2 * noise, 0.0) ** 0.5
-        covered += torch.tensor(
-            [
-                inside(gain, found.gain),
-                inside(shift * scale, found.shift),
-                inside(error * scale, found.error),
-            ]
-        )
+        truth = gain, shift * scale, error * scale
+        intervals = found.gain, found.shift, found.error
+        covered += torch.tensor(list(map(inside, truth, intervals)))
     # Binomial: 95 % of 250 and more than three standard errors.
     assert (covered / num_repetitions > 0.95 - 0.045).all(), covered
     assert (covered / num_repetitions < 0.95 + 0.04).all(), covered
@@ -151,19 +142,6 @@ def test_pairs_that_fit_the_others_are_rarely_named() -> None:
         assert sum(named) <= 0.03 * len(named), n
 
 
-def test_summaries_are_sorted_by_size_and_those_without_discrepancy_are_last() -> None:
-    mean = torch.randn(30, 3).double()
-    x = mean + torch.tensor([0.0, 2.0, -5.0])
-    moments = Moments(
-        means=mean[:, None], covariance=0.01 * torch.eye(3).expand(30, 3, 3)
-    )
-    found = report_discrepancy(x, moments, torch.randn(500, 3), model=MODEL)
-    assert [summary.name for summary in found.summaries] == ["x[2]", "x[1]", "x[0]"]
-    rows = found.as_rows()
-    assert [row["summary"] for row in rows] == ["x[2]", "x[1]", "x[0]"]
-    assert rows[0]["shift_low"] < rows[0]["shift"] < rows[0]["shift_high"] < -4
-
-
 def test_summaries_that_are_constant_in_simulations_are_named() -> None:
     x, moments = pairs(20)
     constant = simulated(500)
@@ -171,7 +149,7 @@ def test_summaries_that_are_constant_in_simulations_are_named() -> None:
     found = report_discrepancy(x, moments, constant, model=MODEL).renamed(NAMES)
     assert found.constant == ("light",)
     assert {summary.name for summary in found.summaries} == set(NAMES[1:])
-    assert "the same in all simulations: light" in str(found)
+    assert "The same in all simulations: light." in str(found)
     with pytest.raises(InvalidInputError, match="all summaries are constant"):
         report_discrepancy(x, moments, torch.ones(500, 4), model=MODEL)
 
@@ -206,15 +184,11 @@ def test_recordings_of_a_person_do_not_make_intervals_narrower() -> None:
     theta, x = shifted(20)
     several = theta.repeat_interleave(3, dim=0)
     own = 0.5 * torch.randn(20, 3)  # errors that recordings of a person share
-    alone = method(simulator=problems.simulate).append_calibration(theta, x + own)
-    together = method(simulator=problems.simulate).append_calibration(
-        several,
-        problems.simulate(several)
-        + torch.tensor([0.0, 0.7, 0.0])
-        + own.repeat_interleave(3, dim=0),
-    )
+    x_several = problems.simulate(several) + own.repeat_interleave(3, dim=0)
+    x_several[:, 1] += 0.7
     widths = []
-    for asked in (alone, together):
+    for pairs in ((theta, x + own), (several, x_several)):
+        asked = method(simulator=problems.simulate).append_calibration(*pairs)
         found = asked.report(seed=0, show_progress_bars=False)
         shifts = [summary.shift for summary in found.summaries]
         widths.append(sum(shift.high - shift.low for shift in shifts))
@@ -225,14 +199,11 @@ def test_recordings_of_a_person_do_not_make_intervals_narrower() -> None:
     numbers = [summary.num_independent for summary in found.summaries]
     assert all(20 <= number < 30 for number in numbers)
     assert "the 60 pairs count as 21 independent ones" in str(found)
-    assert found.as_rows()[0]["num_independent"] == numbers[0]
 
 
 def test_a_report_asks_for_the_data_that_it_lacks() -> None:
     with pytest.raises(NotReadyError, match="simulations"):
         method().append_calibration(*shifted()).report()
-    with pytest.raises(NotReadyError, match="at least 2 calibration pairs; got 0"):
-        method(simulator=problems.simulate).report()
     images = method(simulator=problems.simulate_image)
     theta = problems.box(2).sample((5,))
     images.append_calibration(theta, problems.simulate_image(theta))
@@ -266,36 +237,15 @@ def test_the_discrepancy_of_an_image_is_that_of_its_summaries() -> None:
         assert arrays.as_rows() == found.as_rows()
 
 
-def test_summaries_may_leave_out_missing_trials() -> None:
-    theta = problems.box(2).sample((30,))
-    x = problems.simulate_trials(theta)
-    x[..., 1] += 0.5
-    npe = problems.trials_posterior()
-    asked = DiscrepancyNPE.from_posterior(npe, simulator=problems.simulate_trials)
-    asked.append_calibration(theta, x)
-    found = asked.report(summaries=lambda x: x.nanmean(dim=1), x_names=["a", "b"])
-    assert [s.name for s in found.summaries if s.is_off] == ["b"]
-    assert inside(0.5, found["b"].shift)
-    with pytest.raises(InvalidInputError, match="summaries of the pairs` to be finite"):
-        asked.report(summaries=lambda x: x.mean(dim=1))
-
-
-def tunnel(root: Any, n: int) -> DiscrepancyReport:
-    task = get_task("light_tunnel_sensors", root=root)
-    asked = DiscrepancyNPE(task.get_prior(), simulator=task.get_simulator())
-    asked.append_calibration(*task.get_calibration_set(n))
-    return asked.report(x_names=task.x_names, show_progress_bars=False)
-
-
 @pytest.mark.medium
 def test_the_published_law_of_the_light_tunnel_over_predicts_all_light(
     chamber_root: Any,
 ) -> None:
-    for n in (20, 200):
-        found = tunnel(chamber_root, n)
-        off = {summary.name for summary in found.summaries if summary.is_off}
-        assert off == {f"log_{kind}_{i}" for kind in ("ir", "vis") for i in (1, 2, 3)}
-        for name in off:
-            assert found[name].shift.high < 0, (name, n)  # in log units
-        assert not found["current"].is_off
-        assert "no sign of discrepancy: current" in str(found)
+    task = get_task("light_tunnel_sensors", root=chamber_root)
+    asked = DiscrepancyNPE(task.get_prior(), simulator=task.get_simulator())
+    asked.append_calibration(*task.get_calibration_set(20))
+    found = asked.report(x_names=task.x_names, show_progress_bars=False)
+    off = {summary.name for summary in found.summaries if summary.is_off}
+    assert off == {f"log_{kind}_{i}" for kind in ("ir", "vis") for i in (1, 2, 3)}
+    assert all(found[name].shift.high < 0 for name in off)  # in log units
+    assert "no sign of discrepancy: current" in str(found)
