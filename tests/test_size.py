@@ -13,10 +13,10 @@ import pytest
 ROOT = Path(__file__).parents[1]
 # The most lines of all files of a kind in a folder, docstrings included.
 BUDGETS = {
-    "sbi_rope/*.py": 30_400,
-    "tests/*.py": 25_000,
+    "sbi_rope/*.py": 25_500,
+    "tests/*.py": 20_000,
     "benchmarks/*.py": 4_000,
-    "docs/*.md": 4_000,
+    "docs/*.md": 2_800,
 }
 # Checks live at the boundary: in settings, tensors, and where a posterior is split.
 MOST_CHECKS, CHECKS = 25, ("check", "warn", "refuse")

@@ -48,7 +48,6 @@ THETA, THETA_S, X_O = draw(0, 20, 2), draw(1, 60, 2), 1.4 * draw(4, 20, 2) + 0.7
 X, X_S = 1.4 * (THETA + 0.5 * draw(2, 20, 2)) + 0.7, THETA_S + 0.5 * draw(3, 60, 2)
 
 ONES = torch.ones(20, 2)
-LEVELS = torch.linspace(0.01, 0.99, 40).reshape(20, 2)
 
 
 # --- objects that are made once ---

@@ -269,7 +269,7 @@ def test_the_row_of_ot_only_is_that_of_the_method_of_its_name(tmp_path: Path) ->
     ours = method.build_posterior().log_prob_batched(
         case.test_set[0][None], case.test_set[1]
     )
-    assert torch.equal(ours[0], score.evaluation.lpp.log_probs)
+    assert torch.equal(ours[0], score.evaluation.log_prob)
 
 
 @pytest.mark.slow

@@ -529,7 +529,7 @@ def test_a_page_says_what_printing_says_and_needs_no_other_file(
     assert "<kg>" not in source
     for name in ("left", "<top>"):
         assert name in page.text
-    assert "This need not hold for `x_o`" in page.text
+    assert "This need not hold for x_o" in page.text
     assert f"The coverage of {NAMES[0]} depends on its estimate" in page.text
     for gain in report.gains.values():
         assert f"{gain:+.2f} nats a pair" in page.text
@@ -537,7 +537,7 @@ def test_a_page_says_what_printing_says_and_needs_no_other_file(
         assert f"{row['candidate']} " in page.text
         assert f"{row['score_z']:.2f}" in page.text
     for finding in diagnosis.findings:
-        assert finding.sentence in page.text
+        assert finding.sentence.replace("`", "") in page.text
     for what, value in report.provenance.items():
         assert f"{what} {value}" in page.text
 

@@ -33,8 +33,7 @@ def test_rows_of_the_same_parameters_share_a_number() -> None:
     pairs = pairs_of(theta)
     assert pairs.group.tolist() == [0, 1, 0, 2]
     assert pairs.num_groups == 3
-    assert pairs.counts.weights.tolist() == [0.5, 1.0, 0.5, 1.0]
-    assert pairs.counts.effective_number == pytest.approx(3)
+    assert pairs.shared_weight.tolist() == [0.5, 1.0, 0.5, 1.0]
     assert str(pairs) == "4 exact labels in 3 groups"
 
 
