@@ -1,6 +1,7 @@
 """Scores of a posterior on observations whose true parameters are known."""
 
 import math
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -373,7 +374,11 @@ class Evaluation:
             )
         if excluded := float(torch.isneginf(self.log_prob).double().mean()):
             lines.append(f"  {excluded:.1%} of the true parameters have density zero.")
-        return "\n".join([*lines, *(f"  {text}" for text, _ in self.lines())])
+        lines += [
+            textwrap.fill(text, 88, initial_indent="  ", subsequent_indent="    ")
+            for text, _ in self.lines()
+        ]
+        return "\n".join(lines)
 
     __repr__ = __str__  # which notebooks show
 

@@ -112,15 +112,12 @@ def _help(report: "StackingReport") -> list[tuple[str, bool]]:
         (f"The log density of the labels is {score:.2f} nats a pair {where}.", False)
     )
     if is_corrected(report):
-        comparable = held_out.mean(report.comparable_scores).mean
-        lines.append(
-            (
-                "Without the correction for mass outside the prior it is "
-                f"{comparable - held_out.lpp.mean:+.2f} nats. NPE is not corrected, so "
-                "it is compared with this number.",
-                False,
-            )
+        gain = held_out.lpp.mean - held_out.mean(report.comparable_scores).mean
+        text = (
+            f"The correction for mass outside the prior adds {gain:.2f} nats to it. "
+            "They are left out of the difference from NPE, which is not corrected."
         )
+        lines.append((text, False))
     lines.append(_weights(report))
     if report.labels:
         noisy = report.score_errors is not None
