@@ -115,7 +115,7 @@ def _help(report: "StackingReport") -> list[tuple[str, bool]]:
         gain = held_out.lpp.mean - held_out.mean(report.comparable_scores).mean
         text = (
             f"The correction for mass outside the prior adds {gain:.2f} nats to it. "
-            "They are left out of the difference from NPE, which is not corrected."
+            "These are left out of the difference from NPE, which is not corrected."
         )
         lines.append((text, False))
     lines.append(_weights(report))
