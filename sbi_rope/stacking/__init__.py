@@ -10,11 +10,11 @@ from sbi_rope.stacking.candidates import (
     UnlabelledCandidate,
     default_candidates,
 )
-from sbi_rope.stacking.cross_validation import StackingWeights, stacking_weights
 from sbi_rope.stacking.data import StackData
 from sbi_rope.stacking.posterior import StackedPosterior
 from sbi_rope.stacking.report import LearningCurve, StackingReport
 from sbi_rope.stacking.stack import stack
+from sbi_rope.stacking.weights import StackingWeights, stacking_weights
 
 __all__ = [
     "Candidate",

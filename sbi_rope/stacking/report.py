@@ -15,12 +15,12 @@ from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.metrics import Evaluation
 from sbi_rope.sets import SetScores
 from sbi_rope.settings import Count, check, one_of
-from sbi_rope.stacking.cross_validation import (
+from sbi_rope.stacking.sections import sections_of, text_of
+from sbi_rope.stacking.weights import (
     StackingWeights,
     fold_weights,
     stacking_weights,
 )
-from sbi_rope.stacking.sections import sections_of, text_of
 
 __all__ = ["LearningCurve", "StackingReport"]
 

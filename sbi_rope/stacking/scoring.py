@@ -19,10 +19,10 @@ from sbi_rope.metrics.calls import draw_chunks
 from sbi_rope.metrics.evaluation import estimates_and_ranks
 from sbi_rope.sets import SetScores, joint_scores, marginal_scores
 from sbi_rope.stacking.candidates import Candidate
-from sbi_rope.stacking.cross_validation import fold_weights
 from sbi_rope.stacking.data import StackData
 from sbi_rope.stacking.posterior import fold_posterior
 from sbi_rope.stacking.report import StackingReport
+from sbi_rope.stacking.weights import fold_weights
 
 __all__ = ["score_folds"]
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope.sets import is_held, joint_scores, rank_needed
-from sbi_rope.stacking.cross_validation import fold_weights
+from sbi_rope.stacking.weights import fold_weights
 
 pytestmark = pytest.mark.slow
 

@@ -27,7 +27,7 @@ from sbi_rope.sets import (
     marginal_scores,
     rank_needed,
 )
-from sbi_rope.stacking.cross_validation import fold_weights
+from sbi_rope.stacking.weights import fold_weights
 from tests import gaussian, problems, stacks
 
 # Calibration sets are small here on purpose.
