@@ -120,9 +120,13 @@ def _help(report: "StackingReport") -> list[tuple[str, bool]]:
         lines.append((text, False))
     lines.append(_weights(report))
     if report.labels:
-        noisy = report.score_errors is not None
-        what = " Scores and coverage are those of the labels, with their noise."
-        lines.append((f"Known were {report.labels}.{what if noisy else ''}", False))
+        text = f"Known were {report.labels}."
+        if report.score_errors is not None:
+            text += (
+                " Scores and coverage are those of the labels, with their noise; the "
+                f"Monte-Carlo error is {report.monte_carlo_error:.3f} nats."
+            )
+        lines.append((text, False))
     return lines
 
 
