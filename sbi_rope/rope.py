@@ -114,9 +114,9 @@ class RoPE:
             raises, are dropped and counted. :func:`~sbi_rope.parallel` calls it in
             several processes.
         simulations: Instead of a simulator, stored pairs (theta, x) with theta drawn
-            from the prior; there is a warning if it is distributed otherwise.
-        num_simulations: For a simulator that takes long: how many simulations it makes
-            in all, from the prior, when they are first needed. They are then used as
+            from the prior. There is a warning if theta is distributed otherwise.
+        num_simulations: For a slow simulator, the number of simulations in all. They
+            are made from the prior when they are first needed, and then used like
             stored ones. If None, see :attr:`num_simulator_calls`.
         finetuner: Settings of step 1; ``CalibrationFinetuner()`` if None.
         coupler: Settings of step 2; ``SinkhornCoupler()`` if None.
@@ -128,8 +128,8 @@ class RoPE:
         source: Where simulations come from.
 
     Raises:
-        UnsupportedPosteriorError: If the posterior has no embedding to work with, or
-            one that embeds a row of a batch differently among other rows.
+        UnsupportedPosteriorError: If the posterior has no embedding to work with, or if
+            the embedding of a row depends on the other rows of a batch.
         SimulationError: If the simulator raises or returns something unusable.
 
     Example:
@@ -204,17 +204,19 @@ class RoPE:
         r"""Add real observations with known parameters to those appended so far.
 
         Labels need not be exact. A label is then a measurement
-        :math:`y \sim \mathcal N(\theta, R)` of some or all of the parameters, and what
-        needs the parameters averages over :math:`p(\theta \mid y)` under the prior.
+        :math:`y \sim \mathcal N(\theta, R)` of some or all of the parameters.
+        Whatever needs the parameters is averaged over :math:`p(\theta \mid y)` under
+        the prior.
 
-        Tensors, arrays, tables and lists of numbers are taken wherever a user passes
-        data. A table with the column names that RoPE knows is put into their order.
-        The rows of theta and x are paired as they stand, whatever their row labels are.
+        Tensors, arrays, tables and lists of numbers are taken, as wherever you pass
+        data. The columns of a table are put into the order of the names that RoPE
+        knows. Rows of theta and x are paired by position, not by their row labels.
 
         Args:
             theta: Parameters, shape ``(n, d)``, inside the prior's support. NaN stands
-                for a parameter that was not measured. More general labels are draws
-                from :math:`p(\theta \mid y)` under the prior, shape ``(n, S, d)``.
+                for a parameter that was not measured. In the most general case, a
+                label is S draws from :math:`p(\theta \mid y)` under the prior, shape
+                ``(n, S, d)``.
             x: Real observations, shape ``(n, *event)``.
             theta_std: The standard deviations of the measurements, in the units of
                 theta: a number, or shape ``(d,)`` or ``(n, d)``. Zero is exact. A label
@@ -222,9 +224,9 @@ class RoPE:
             theta_cov: Instead of ``theta_std``, the covariance of the measurements,
                 shape ``(d, d)`` or ``(n, d, d)``.
             weights: How many pairs each pair counts as, shape ``(n,)``; one if None.
-            groups: A number or a name for each pair. Pairs with the same are recordings
+            groups: A number or a name for each pair. Pairs of one group are recordings
                 of one person or specimen. They are held out together, and count once
-                where they are scored. If None, pairs with equal labels are a group.
+                in scores. If None, pairs with equal labels are a group.
 
         Returns:
             Itself, so that calls can be chained.
@@ -308,7 +310,7 @@ class RoPE:
 
         Every call starts from the embedding net of NPE. Where labels are not exact,
         targets are averages given the label and x, under a discrepancy model of the
-        embedding, and take one simulation at each draw of a label.
+        embedding. They take one simulation at each draw of a label.
 
         Args:
             seed: Seed of the simulations and of the hold-out split, for torch, NumPy
@@ -391,8 +393,8 @@ class RoPE:
     ) -> EmbeddedBatch:
         r"""Return the embeddings of real observations and of simulations.
 
-        The arguments are those of :meth:`build_posterior`, which with the same
-        ``num_simulations`` and ``seed`` couples with the same simulations.
+        The arguments are those of :meth:`build_posterior`. With the same
+        ``num_simulations`` and ``seed``, it couples with the same simulations.
         """
         if len(self.pairs) and self._g is None:
             raise NotReadyError(
@@ -497,7 +499,7 @@ class RoPE:
 
     @property
     def calibration(self) -> tuple[Tensor, Tensor]:
-        """The pairs so far, theta (its mean given a label that is not exact) and x."""
+        """The pairs so far, theta and x; theta is a mean if a label is not exact."""
         return self.pairs.mean.clone(), self.pairs.x.clone()
 
     @property

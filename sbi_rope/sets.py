@@ -4,7 +4,7 @@ The score :math:`S(x, \theta)` is the level of the smallest set of highest densi
 contains the parameters, or of the smallest central interval of one parameter. A set
 holds all parameters whose score is at most its level :math:`1 - \alpha`. For a
 guarantee, the scores :math:`S_i` of n calibration pairs take the place of the level.
-Each is that of the posterior of its fold k(i), which has not seen the pair:
+Each score is that of the posterior of fold k(i), which has not seen the pair:
 
 .. math:: \Big\{\theta:
     \#\{i: S_i < S_{k(i)}(x, \theta)\} < \lceil (1 - \alpha)(n + 1) \rceil \Big\}
@@ -129,9 +129,9 @@ def is_held(scores: Tensor, fold: Tensor, at_theta: Tensor, *, rank: int) -> Ten
 class Guarantee:
     r"""The promise of a set or interval, for observations drawn as the pairs were.
 
-    Let the calibration pairs and the new observation with its parameters be
-    exchangeable, as pairs are that are drawn independently from one distribution. The
-    set then holds the parameters with a probability of at least
+    Suppose that the calibration pairs and the new observation with its parameters are
+    exchangeable, as independent draws from one distribution are. The set then holds
+    the parameters with a probability of at least
 
     .. math:: 1 - 2 \alpha - \min\Big\{ \frac{2 (1 - 1/K)}{n/K + 1},
         \frac{1 - K/n}{K + 1} \Big\}, \qquad \alpha = 1 - \text{level},
@@ -179,10 +179,10 @@ class Guarantee:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SetScores:
-    """The held-out scores of n pairs, from which sets with a guarantee are made.
+    """The out-of-fold scores of n pairs, from which sets with a guarantee are made.
 
-    Their labels are exact. Pairs of one group are not exchangeable one by one, so that
-    one of them counts, chosen at random.
+    All labels are exact. Pairs of one group are not exchangeable, so that only one of
+    them counts, chosen at random.
 
     Attributes:
         joint: The ``joint_scores`` of the true parameters, shape ``(n,)``.
@@ -206,9 +206,9 @@ class SetScores:
         return float((self.joint <= level).double().mean())
 
     def level_needed(self, level: float) -> float:
-        """Return the level of sets of highest density as large as guaranteed ones.
+        """Return the level of highest-density sets as large as guaranteed ones.
 
-        Above 1 they reach further than all draws.
+        A level above 1 means that they reach further than all draws.
         """
         return float(self.joint.kthvalue(rank_needed(level, len(self))).values)
 
@@ -396,9 +396,10 @@ class MakesSets:
 
         It is the set of highest density,
         :math:`\{\theta: \log p(\theta \mid x) \ge t\}`, with t the (1 - level)
-        quantile of the log density of draws. It holds the true parameters this often
-        only if the posterior is calibrated. With ``guaranteed``, a stack corrects it by
-        its held-out scores, see :class:`~sbi_rope.sets.Guarantee`.
+        quantile of the log density of draws. It holds the true parameters with
+        the probability ``level`` only if the posterior is calibrated. With
+        ``guaranteed``, a stack corrects it by its out-of-fold scores, see
+        :class:`~sbi_rope.sets.Guarantee`.
 
         Args:
             level: The probability of the set.
@@ -408,7 +409,7 @@ class MakesSets:
                 ``level`` of the cases, even if the posterior is not calibrated. This
                 needs a stack, and observations drawn as its calibration pairs.
             num_samples: The number of draws that the set and its volume are estimated
-                from, one of which has to be outside at least.
+                from. At least one of them has to be outside the set.
             seed: Seed of the draws; None uses the states of torch, NumPy and Python.
 
         Returns:
@@ -463,14 +464,14 @@ class MakesSets:
         """Return an interval for each parameter given an observation, or each of B.
 
         It is the central interval of draws. With ``guaranteed``, a stack corrects it by
-        its held-out scores.
+        its out-of-fold scores.
 
         Args:
             level: The probability of each interval by itself.
             x: As in :meth:`credible_set`.
             guaranteed: As in :meth:`credible_set`.
-            num_samples: The number of draws, one of which has to be beyond each end at
-                least. With ``guaranteed`` there are as many as the stack was scored
+            num_samples: The number of draws. At least one of them has to be beyond each
+                end. With ``guaranteed`` there are as many as the stack was scored
                 with.
             seed: As in :meth:`credible_set`.
 
@@ -500,7 +501,7 @@ class MakesSets:
         return CredibleIntervals(low, high, level, guarantee, self.parameter_names)
 
     def _held_out(self) -> tuple[SetScores, Sequence[Any]]:
-        """Return held-out scores, and the stack that has not seen each fold."""
+        """Return out-of-fold scores, and the stack that has not seen each fold."""
         raise InvalidInputError(
             "Expected a stack for a set with a guarantee; got "
             f"{type(self).__name__}. Make one with `stack(rope)`."

@@ -54,18 +54,18 @@ def diagnose(
     1. Is the batch like the observations of the calibration pairs? This is an energy
        test of :math:`h(x_o)`, and of NPE's estimate of each parameter.
     2. Is an entry of x many standard deviations away from simulations?
-    3. Do the parameters of the batch follow the prior? Those of the simulations,
-       weighted by the coupling at tau = 0, are compared with it.
+    3. Do the parameters of the batch follow the prior? The parameters of
+       simulations, weighted by the coupling at tau = 0, are compared with the prior.
     4. Does :math:`h(x_o)` differ from :math:`h(x_s)`? This is sbi's MMD test.
-    5. Does :math:`g(x_o)` still differ from it, after tuning?
+    5. Does :math:`g(x_o)` still differ from simulations, after tuning?
     6. Which observations have no simulation near them?
     7. How many simulations are behind each posterior?
     8. Do the residuals :math:`g(x) - E[h(S(\theta))]` of calibration pairs depend on
        :math:`\theta`? They are computed on pairs that g was not trained on.
 
     The last four are about RoPE only. Without calibration pairs g is h, and 1, 5 and 8
-    are left out. Each of 1, 3, 4, 5 and 6 is alarming by chance in one batch of a
-    hundred. The thresholds of 7 are rules of thumb about gamma.
+    are left out. Each of 1, 3, 4, 5 and 6 raises an alarm by chance in one batch of
+    a hundred. The thresholds of 7 are rules of thumb about gamma.
 
     Args:
         rope: A RoPE, which is not changed. If calibration pairs were appended but not

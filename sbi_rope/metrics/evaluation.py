@@ -77,7 +77,7 @@ class Dependence:
     def found(self) -> tuple[bool, ...]:
         """Whether the coverage of each parameter depends on its estimate.
 
-        One in twenty calibrated posteriors has any such parameter at most (Bonferroni).
+        At most one calibrated posterior in twenty has such a parameter (Bonferroni).
         """
         return tuple(p * self.num_tested < FALSE_ALARMS for p in self.p_values)
 
@@ -95,9 +95,9 @@ class Evaluation:
         ranks: The rank of each true parameter among samples of the posterior, from 0 to
             1, shape ``(n, d)``; NaN where a parameter is not known. Ranks are uniform
             if the posterior is calibrated.
-        estimates: The posterior means, of other samples than the ranks, shape
-            ``(n, d)``. Of the same samples, those that are too high by chance raise the
-            mean and lower the rank.
+        estimates: The posterior means, shape ``(n, d)``. They are of other samples than
+            the ranks, because samples that are too high by chance would raise the mean
+            and lower the rank.
         log_unit: The log of the unit of theta in :attr:`lpp_z`, summed over parameters,
             a number or one for each observation; NaN if it is unknown.
         weight: The weight of each observation, shape ``(n,)``; one each if None.
@@ -135,7 +135,7 @@ class Evaluation:
         return effective_number(weight) if len(weight) else 0.0
 
     def mean(self, values: Tensor, *, confidence: float = 0.95) -> Estimate:
-        """Return the mean of a number of each observation, shape ``(n,)``."""
+        """Return the mean over observations of one number each, shape ``(n,)``."""
         return Estimate.of(values, self.weight, self.group, confidence=confidence)
 
     @property
@@ -162,7 +162,7 @@ class Evaluation:
 
     @property
     def levels(self) -> Tensor:
-        r"""The level of the smallest central interval with each true parameter.
+        r"""The level of the smallest central interval that holds each true parameter.
 
         .. math:: a^* = |2 u - 1|
 
@@ -178,9 +178,10 @@ class Evaluation:
             - \mathbf{1}[\theta_{ij} \in \Theta_{ij}(\alpha)] \,\mathrm{d}\alpha
             = \frac{1}{d n} \sum_{j, i} a^*_{ij} - \frac{1}{2}
 
-        The interval is wider than that of other means by :math:`\sqrt{n / (n - 1)}`. It
-        would be too narrow for a few uniform levels: with 10 to 50 observations and one
-        to five parameters, it now leaves 0 out for 4 to 5 % of calibrated posteriors.
+        The interval is wider than that of other means by :math:`\sqrt{n / (n - 1)}`.
+        Without this factor, it would be too narrow for a few uniform levels. With it,
+        the interval leaves 0 out for 4 to 5 % of calibrated posteriors, with 10 to 50
+        observations and one to five parameters.
 
         References:
             | Addressing Misspecification in Simulation-based Inference through
@@ -243,8 +244,8 @@ class Evaluation:
 
         Coverage that is right on average can be wrong for small and for large
         parameters. The ranks u and the levels :math:`|2u - 1|` are regressed on the
-        ranks of the posterior means and on their squares. The first shows a bias that
-        differs from region to region, the second a wrong width in some. The test is
+        ranks of the posterior means and on their squares. The ranks u show a bias that
+        differs from region to region, the levels a wrong width in some. The test is
         exact if the posterior is calibrated, and does not react to errors that are the
         same everywhere, which :attr:`acauc` measures. One observation of each group is
         tested.
@@ -408,9 +409,9 @@ def evaluate(
 ) -> Evaluation:
     r"""Score a posterior by the density of the true parameters and by calibration.
 
-    sbi's own posteriors are scored as their network states them: their rejection of
-    samples outside the prior, and their correction of the density for it, may never
-    end on real data. Mass outside the prior counts as an error.
+    sbi's own posteriors are scored without rejecting samples outside the prior, and
+    without correcting the density for the rejection: both may never end on real data.
+    Mass outside the prior counts as an error.
 
     Args:
         posterior: Any posterior with ``sample_batched`` and ``log_prob_batched``.

@@ -44,7 +44,7 @@ def stack(
     seed: int | None = None,
     show_progress_bars: bool | None = None,
 ) -> StackedPosterior:
-    r"""Mix candidate posteriors with the weights that score best on held-out pairs.
+    r"""Mix candidate posteriors with the weights that score best on hold-out pairs.
 
     The calibration pairs are divided into folds. Every candidate is trained without
     each fold and scored on that fold, and the posterior is the mixture of the
@@ -55,10 +55,10 @@ def stack(
     fold, and one trained on all pairs. By Jensen's inequality the average has a higher
     expected score than single versions, for observations like those of the pairs.
 
-    Weights, scores and calibration in the report hold for such observations. With
-    ``x_o`` these are compared with the pairs by an energy test of their embeddings, and
-    a p-value below 0.01 gives a warning. Without it, :func:`~sbi_rope.diagnose` makes
-    the same comparison.
+    Weights, scores and calibration in the report hold for such observations. If you
+    pass ``x_o``, it is compared with the pairs by an energy test of the embeddings, and
+    a p-value below 0.01 gives a warning. :func:`~sbi_rope.diagnose` makes the same
+    comparison.
 
     Args:
         rope: A RoPE with calibration pairs. It need not be trained. Only its counts of
@@ -72,9 +72,9 @@ def stack(
             NPE, discrepancy models and regressions. A posterior, or a density of your
             own, that has not seen the pairs is taken as it is, see
             :class:`~sbi_rope.stacking.GivenCandidate`.
-        num_folds: The number of folds, at most the number of groups. Pairs with equal
-            labels, or of the same of the ``groups`` that were appended, are in the same
-            fold.
+        num_folds: The number of folds, at most the number of groups. Pairs of
+            one group are in the same fold. Groups are those that were appended, or else
+            pairs with equal labels.
         learning_curve: Whether to train on fewer folds too, so that the report can
             estimate what more labels would add. It takes about twice the time.
         seed: Seed of everything random; None uses the states of torch, NumPy and
@@ -88,11 +88,11 @@ def stack(
     Raises:
         NotReadyError: If there are fewer than two groups of pairs.
         InvalidInputError: If an argument is outside its range or has the wrong shape,
-            or if entries of x are missing (NaN) that a candidate with
-            ``space="input"`` corrects.
+            or if a candidate with ``space="input"`` corrects x and some of its entries
+            are missing (NaN).
         UnsupportedPosteriorError: If NPE or a candidate has no density.
         SamplingError: If the candidates have almost no mass inside the support of the
-            prior at a held-out observation.
+            prior at a hold-out observation.
         SimulationError: If the simulator fails.
     """
     check("rope", rope, RoPE)
