@@ -83,16 +83,16 @@ def overconfident(npe: Any, posterior: Any, theta_o: Tensor, x_o: Tensor) -> "Fi
 
 
 def intervals(npe: Any, posterior: Any, theta: Tensor, x: Tensor) -> "Figure":
-    """Draw intervals of the first parameter of sixty test measurements."""
+    """Draw intervals of the brightness of blue, of sixty test measurements."""
     figure = plt.figure(figsize=(8, 3.6), layout="constrained")
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
     rows = torch.randperm(len(theta), generator=torch.Generator().manual_seed(0))[:60]
     for axes, (name, one) in zip(
         panels, {"NPE": npe, "stack": posterior}.items(), strict=True
     ):
-        samples = draw_samples(one, x, num_samples=1000)[..., 0]
+        samples = draw_samples(one, x, num_samples=1000)[..., 2]
         low, middle, high = samples.quantile(torch.tensor([0.05, 0.5, 0.95]), dim=0)
-        truth = theta[:, 0]
+        truth = theta[:, 2]
         inside = (low <= truth) & (truth <= high)
         for rows_of, color in (
             (rows[inside[rows]], "#0072B2"),
@@ -104,7 +104,7 @@ def intervals(npe: Any, posterior: Any, theta: Tensor, x: Tensor) -> "Figure":
             )
         axes.axline((0, 0), slope=1, color="0.4", lw=0.8, zorder=0)
         share = f"{inside.double().mean():.0%} of 90% intervals hold the truth"
-        axes.set(title=f"{name}: {share}", xlabel="true brightness of red")
+        axes.set(title=f"{name}: {share}", xlabel="true brightness of blue")
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("inferred, with 90% interval")
     return figure

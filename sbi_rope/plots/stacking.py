@@ -74,7 +74,7 @@ def stacking_report(report: StackingReport) -> "Figure":
     weights.tick_params(axis="y", length=0, labelleft=False)
     others = sum(row["weight"] for row in rows[MAX_CANDIDATES:])
     note = f"\n({others:.0%} on those not shown)" if rows[MAX_CANDIDATES:] else ""
-    weights.set_xlim(0, 1.25 * max(row["weight"] for row in shown))
+    weights.set_xlim(0, 1.35 * max(row["weight"] for row in shown))
     weights.set_xlabel(f"weight in the stack{note}", fontsize=SMALL)
     _draw_coverage(figure.add_subplot(places[0]), report)
     if curve is not None:
