@@ -582,8 +582,8 @@ class TrainedNPE:
         ).to(self.like.dtype, copy=True)
         if not (can_read := self.readable(x)).all():
             raise InvalidInputError(
-                f"Expected `{name}` that the embedding net of NPE can read; got NaN or "
-                f"Inf in {rows_with(~can_read)}."
+                f"Expected `{name}` without NaN or Inf that the embedding net of NPE "
+                f"cannot read; got {rows_with(~can_read)}."
             )
         return x
 

@@ -104,10 +104,10 @@ def given_groups(groups: Any, n: int) -> tuple[Hashable, ...]:
         return ()
     # Tensors and arrays become Python's numbers, which are equal if they are.
     names = tuple(groups.tolist() if hasattr(groups, "tolist") else groups)
-    if len(names) != n:
+    if len(names) != n or any(name is None or name != name for name in names):
         raise InvalidInputError(
             f"Expected `groups` with one number or name for each of {n} pairs; got "
-            f"{len(names)}."
+            f"{len(names)}, or some that are missing."
         )
     return names
 

@@ -110,9 +110,9 @@ class RoPE:
             ``(d,)`` to one ``(*event)``. It may take tensors or NumPy arrays (of
             float64), and return either, lists, or numbers. A row of x may depend on the
             same row of theta only, with noise from the global generator of torch, NumPy
-            or Python. Simulations with NaN or Inf, and those for which the simulator
-            raises, are dropped and counted. :func:`~sbi_rope.parallel` calls it in
-            several processes.
+            or Python. Simulations that the embedding net cannot read (NaN or Inf), and
+            those for which the simulator raises, are dropped and counted.
+            :func:`~sbi_rope.parallel` calls it in several processes.
         simulations: Instead of a simulator, stored pairs (theta, x) with theta drawn
             from the prior. There is a warning if theta is distributed otherwise.
         num_simulations: For a slow simulator, the number of simulations in all. They

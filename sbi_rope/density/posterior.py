@@ -214,7 +214,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         x = as_batch("x", x, density.condition_shape, finite=False).to(density.device)
         if not torch.isfinite(x).all() and (unread := ~density.readable(x)).any():
             raise InvalidInputError(
-                "Expected `x` that the embedding net can read; got NaN or Inf in "
+                "Expected `x` without NaN or Inf that the embedding net cannot read; got "
                 f"{rows_with(unread)}."
             )
         return x

@@ -61,11 +61,14 @@ class Dependence:
         p_values: The p-value of each parameter; NaN with fewer than ten observations.
         shares: The share of true parameters inside their 90 % intervals, for the
             lowest, the middle and the highest third of the estimates, shape ``(d, 3)``.
+        above: The share of true parameters above the posterior's median in each third,
+            shape ``(d, 3)``; about one half if the posterior is calibrated.
         edges: The estimates that divide the thirds, shape ``(d, 2)``.
     """
 
     p_values: tuple[float, ...]
     shares: Tensor = field(repr=False)
+    above: Tensor = field(repr=False)
     edges: Tensor = field(repr=False)
 
     @property
@@ -265,17 +268,20 @@ class Evaluation:
         # A third of the observations each, even if estimates are equal.
         place = estimates.where(known, torch.inf).argsort(dim=0, stable=True)
         part = place.argsort(dim=0) * NUM_PARTS // known.sum(dim=0).clamp_min(1)
-        inside = self._event(self.levels <= LEVEL + ROUNDING).cpu()
         weight = None if self.weight is None else self.weight.cpu()
-        thirds = range(NUM_PARTS)
+
+        def in_thirds(happened: Tensor) -> Tensor:
+            event = self._event(happened).cpu()
+            each = [event.where(part == t, torch.nan) for t in range(NUM_PARTS)]
+            return torch.stack([_means(one, weight) for one in each], dim=1)
+
         return Dependence(
             p_values=tuple(
                 _p_value(ranks[tested[:, k], k], estimates[tested[:, k], k])
                 for k in columns
             ),
-            shares=torch.stack(
-                [_means(inside.where(part == t, torch.nan), weight) for t in thirds], 1
-            ),
+            shares=in_thirds(self.levels <= LEVEL + ROUNDING),
+            above=in_thirds(self.ranks > 0.5),
             edges=torch.stack([_edges(estimates[known[:, k], k]) for k in columns]),
         )
 
@@ -311,7 +317,8 @@ class Evaluation:
         ]
         if verdict == "calibrated":
             average = ", on average over parameters," if off else ""
-            start = f"Calibrated{average} as far as {n:.0f} observations can tell"
+            what = "observations" if self.group is None else "groups"
+            start = f"Calibrated{average} as far as {n:.0f} {what} can tell"
         else:
             start = f"The posterior is {verdict}"
         return [
@@ -338,17 +345,18 @@ class Evaluation:
             return []
         lines = [
             (
-                f"The coverage of {name} depends on its estimate (p = {p_value:.1g}): "
-                f"{LEVEL:.0%} intervals hold {_listed(shares)} of the {known} where "
-                f"estimates are low (below {edges[0]:.3g}), middling and high (above "
-                f"{edges[1]:.3g}).",
+                f"The coverage of {name} depends on its estimate (p = {p_value:.1g}). "
+                f"Where estimates are low (below {edges[0]:.3g}), middling and high "
+                f"(above {edges[1]:.3g}), {LEVEL:.0%} intervals hold {_listed(shares)} "
+                f"of the {known}, and {_listed(above)} are above the median.",
                 True,
             )
-            for name, p_value, edges, shares, depends in zip(
+            for name, p_value, edges, shares, above, depends in zip(
                 names,
                 found.p_values,
                 found.edges.tolist(),
                 found.shares.tolist(),
+                found.above.tolist(),
                 found.found,
                 strict=True,
             )

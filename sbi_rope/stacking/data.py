@@ -64,9 +64,10 @@ class StackData:
         self.estimator, self.source = estimator_of(self.npe), rope.source
         self.prior, self.pairs = PriorDistribution(self.npe.prior), rope.pairs
         self.model = DiscrepancyModel()
-        if (count := self.pairs.num_groups) < 2:
+        labels = len(self.pairs.label.group.unique())
+        if (count := min(self.pairs.num_groups, labels)) < 2:
             raise NotReadyError(
-                "Expected at least 2 calibration pairs with different parameters or "
+                "Expected at least 2 calibration pairs with different parameters and "
                 f"groups; got {count}."
             )
         of_folds, self.seed = draw_seeds(seed, 2)

@@ -146,7 +146,11 @@ def _compared(name: str, gain: Estimate) -> tuple[str, bool]:
 
 def _weights(report: "StackingReport") -> tuple[str, bool]:
     weights = report.family_weights
-    listed = ", ".join(f"{k} {w:.0%}" for k, w in weights.items() if w >= SMALL_WEIGHT)
+    listed = ", ".join(
+        f"{family} {weight:.0%}{_how_many(report, family)}"
+        for family, weight in weights.items()
+        if weight >= SMALL_WEIGHT
+    )
     family, weight = next(iter(weights.items()))
     if weight < MOSTLY:
         return f"No method has half of the weight: {listed}.", False
@@ -156,6 +160,11 @@ def _weights(report: "StackingReport") -> tuple[str, bool]:
     if family == "prior":
         text += " Check that rows of theta and x belong together."
     return text, family == "prior"
+
+
+def _how_many(report: "StackingReport", family: str) -> str:
+    count = report.families.count(family)
+    return f" ({count} candidates)" if count > 1 else ""
 
 
 def _trust(
@@ -191,7 +200,11 @@ def _prior(report: "StackingReport") -> list[tuple[str, bool]]:
         "`candidates=default_candidates(rope, learn_prior=False)`."
     )
     if (kept := report.score_of_prior_kept) is not None:
-        text += f" The best candidate that keeps the prior scores {kept:.2f} here."
+        text += (
+            " The best candidate that keeps the prior is "
+            f"{kept - report.held_out.mean(report.comparable_scores).mean:+.2f} nats "
+            "from the stack here."
+        )
     return [(text, True)]
 
 
@@ -216,11 +229,14 @@ def _sets(report: "StackingReport") -> list[tuple[str, bool]]:
 def _assumption(report: "StackingReport") -> tuple[str, bool]:
     test, start = report.batch, "This holds for observations like those of the pairs"
     if test is None:
-        return f"{start}; `diagnose(rope, x_o)` compares others with them.", False
+        return (
+            f"{start}; `diagnose(rope, x_o, posterior=posterior)` tests others.",
+            False,
+        )
     if test.is_different:
         return (
             f"This need not hold for `x_o`, which differs from the pairs (p = "
-            f"{test.p_value:.3f}); look at `diagnose(rope, x_o)`.",
+            f"{test.p_value:.3f}); look at `diagnose(rope, x_o, posterior=posterior)`.",
             True,
         )
     return f"{start}; `x_o` is like them (p = {test.p_value:.2f}).", False
@@ -231,8 +247,9 @@ def _simulator(report: "StackingReport") -> list[tuple[str, bool]]:
     if found is None:
         return [
             (
-                "Not tested: entries of x are compared only if it is a complete vector "
-                "that a discrepancy model of the stack reads.",
+                "Not tested: entries of x are compared if x is a complete vector. "
+                "`DiscrepancyNPE.report(summaries=...)` compares summaries of series, "
+                "images and sets.",
                 False,
             )
         ]
@@ -260,10 +277,11 @@ def _more_labels(report: "StackingReport") -> list[tuple[str, bool]]:
     if curve is None:
         return [("Not tested: `stack(rope, learning_curve=True)` estimates it.", False)]
     points = ", ".join(
-        f"{score.mean:.2f} with {n}"
-        for n, score in zip(curve.num_pairs, curve.scores, strict=True)
+        f"{one.lpp.mean - curve.evaluations[0].lpp.mean:+.2f} nats with {n}"
+        for n, one in zip(curve.num_pairs[1:], curve.evaluations[1:], strict=True)
     )
-    lines = [(f"Log density by training pairs, in nats: {points}.", False)]
+    start = f"Compared with training on {curve.num_pairs[0]} pairs"
+    lines = [(f"{start}: {points or 'unknown'}.", False)]
     kind = "labels" if curve.evaluations[0].group is None else "groups"
     for more in dict.fromkeys((FEW_MORE, curve.num_labels)):
         gain = curve.gain(more)

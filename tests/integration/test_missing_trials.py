@@ -90,7 +90,7 @@ def test_what_the_net_cannot_read_is_refused() -> None:
     for row, value in (((2,), torch.nan), ((4, 0, 0), torch.inf)):
         theta, x = labelled(10)
         x[row] = value
-        match = rf"can read; got .*\(first: \[{row[0]}\]\)"
+        match = rf"cannot read; got .*\(first: \[{row[0]}\]\)"
         with pytest.raises(InvalidInputError, match=match):
             rope().append_calibration(theta, x)
     theta, x = labelled(10)
