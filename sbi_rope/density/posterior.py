@@ -214,8 +214,8 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         x = as_batch("x", x, density.condition_shape, finite=False).to(density.device)
         if not torch.isfinite(x).all() and (unread := ~density.readable(x)).any():
             raise InvalidInputError(
-                "Expected `x` without NaN or Inf that the embedding net cannot read; got "
-                f"{rows_with(unread)}."
+                "Expected `x` without NaN or Inf that the embedding net cannot read; "
+                f"got {rows_with(unread)}."
             )
         return x
 
