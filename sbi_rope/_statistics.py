@@ -105,6 +105,8 @@ class Estimate:
         return cls(mean, mean - half, mean + half)
 
     def __format__(self, spec: str) -> str:
+        if math.isnan(self.low):
+            return format(self.mean, spec)
         low, high = format(self.low, spec), format(self.high, spec)
         return f"{format(self.mean, spec)} ({low} to {high})"
 

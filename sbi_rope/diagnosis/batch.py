@@ -76,8 +76,9 @@ def diagnose(
         num_folds: The number of trainings for 8, each of which takes as long as
             ``rope.train``. None leaves out 8, and the allowance for errors of g in 3.
         posterior: The posterior that you use, made with the same pairs. For a stack 5
-            to 8 are left out. A shift of 3 is then no alarm if the stack has learned it
-            from the pairs, and 1 shows no sign of a difference.
+            to 8 are left out; 6 takes the place of 2 if x is not standardised. A shift
+            of 3 is no alarm if the stack has learned it from the pairs, and 1 shows no
+            sign of a difference.
         parameter_names: One name for each parameter. If None, those of ``rope``, or
             "theta_1" and so on.
         seed: Seed of everything random; None uses the states of torch, NumPy and
@@ -131,13 +132,17 @@ def diagnose(
         learned: tuple[str, ...] = ()
         if like_pairs and not like_pairs.is_different and _has_learned(posterior):
             learned = like_pairs.alike(names)
+        far = far_entries(npe.h, batch.x_o)
         findings = [
             unlike_pairs(like_pairs, names),
-            far_entries(npe.h, batch.x_o),
+            far,
             *shifts(shift, simulations, names, learned),
             before_tuning(before, tuned=tuned),
         ]
-        if not isinstance(posterior, StackedPosterior):
+        if isinstance(posterior, StackedPosterior):
+            if far.value is None:  # so that a single broken observation is found
+                findings.append(unmatched(distance, len(simulated)))
+        else:
             findings += [
                 after_tuning(after, before),
                 unmatched(distance, len(simulated)),

@@ -138,7 +138,7 @@ def far_entries(embedding_net: nn.Module, x_o: Tensor) -> Finding:
     """Say how far the farthest entry of x is from simulations."""
     name, far = "entries far from simulations", deviations(embedding_net, x_o)
     if far is None:
-        why = "NPE does not standardise x entry by entry (as for sets of trials)"
+        why = 'NPE does not standardise x (`z_score_x="independent"` does)'
         return Finding(name, f"Not tested, because {why}.")
     far = far.flatten(1)
     row, column = divmod(int(far.argmax()), far.shape[1])
@@ -190,7 +190,7 @@ def unmatched(distance: Tensor, num_simulations: int) -> Finding:
         value, threshold = farthest, FAR_AWAY
     if alarming := value > threshold:
         shown = ", ".join(map(str, flags[:10])) + (", ..." if flags[10:] else "")
-        sentence += f" Look at {shown} before you trust RoPE's posteriors there."
+        sentence += f" Look at {shown} before you trust their posteriors."
     name = "observations no simulation matches"
     return Finding(name, sentence, alarming, value, threshold)
 

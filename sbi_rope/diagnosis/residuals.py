@@ -140,7 +140,7 @@ def bias_finding(residuals: Tensor, theta: Tensor, simulations: Simulations) -> 
     value = max(bias - 1.645 * error, 0.0) / unit
     alarming = p_value < LEVEL and value > LARGEST_RATIO
     sentence = (
-        f"The bias that depends on the parameters is {bias / unit:.2g} times the "
+        f"The bias that depends on the parameters is at least {value:.2g} times the "
         f"simulator's noise (p = {p_value:.2g}); averaging over noise gives up to "
         f"{LARGEST_RATIO}."
     )

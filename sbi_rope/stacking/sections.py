@@ -114,8 +114,8 @@ def _help(report: "StackingReport") -> list[tuple[str, bool]]:
     if is_corrected(report):
         gain = held_out.lpp.mean - held_out.mean(report.comparable_scores).mean
         text = (
-            f"The correction for mass outside the prior adds {gain:.2f} nats to it. "
-            "These are left out of the difference from NPE, which is not corrected."
+            f"{gain:.2f} nats of it come from the correction for mass outside the "
+            "prior, which the difference from NPE leaves out."
         )
         lines.append((text, False))
     lines.append(_weights(report))
@@ -146,7 +146,7 @@ def _compared(name: str, gain: Estimate) -> tuple[str, bool]:
 
 def _weights(report: "StackingReport") -> tuple[str, bool]:
     weights = report.family_weights
-    listed = ", ".join(
+    listed = "; ".join(
         f"{family} {weight:.0%}{_how_many(report, family)}"
         for family, weight in weights.items()
         if weight >= SMALL_WEIGHT
@@ -181,7 +181,12 @@ def _trust(
     ):
         advice = "Collect more labels, or take intervals of a higher level than needed."
         lines.append((advice, True))
-    return [*lines, *_prior(report), *_sets(report), _assumption(report)]
+    wider = (
+        f"These are scores of versions trained on {report.num_trained_on} pairs. Their "
+        "average is deployed, which is usually a little wider.",
+        False,
+    )
+    return [*lines, wider, *_prior(report), *_sets(report), _assumption(report)]
 
 
 def _prior(report: "StackingReport") -> list[tuple[str, bool]]:
