@@ -609,7 +609,7 @@ def moments(
     residual = simulated - level
     freedom = simulated.new_full((len(theta),), theta.shape[1] - 1)
     fits = []
-    for terms in [] if pairs.are_exact else _features(theta.double()):
+    for terms in [] if pairs.theta.shape[1] == 1 else _features(theta.double()):
         fitted, used = _regressed(residual, terms)
         residual = residual - fitted
         freedom = freedom - used

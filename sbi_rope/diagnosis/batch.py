@@ -97,6 +97,7 @@ def diagnose(
     check("rope", rope, RoPE)
     check("posterior", posterior, MixturePosterior | None)
     check("num_folds", num_folds, Folds | None)
+    x_o = rope.checked_observations(x_o)  # before anybody waits for a training
     pairs, tuned = rope.pairs, len(rope.pairs) > 0
     if tuned and not rope.is_trained:
         rope = copy.copy(rope)  # which shares all data

@@ -382,7 +382,10 @@ class Evaluation:
                 f"  LPP with theta in prior standard deviations: {self.lpp_z:.2f}"
             )
         if excluded := float(torch.isneginf(self.log_prob).double().mean()):
-            lines.append(f"  {excluded:.1%} of the true parameters have density zero.")
+            lines.append(
+                f"  {excluded:.1%} of the true parameters have density zero: they are "
+                "outside the prior, or in another unit."
+            )
         lines += [
             textwrap.fill(text, 88, initial_indent="  ", subsequent_indent="    ")
             for text, _ in self.lines()

@@ -68,7 +68,7 @@ class StackData:
         if (count := min(self.pairs.num_groups, labels)) < 2:
             raise NotReadyError(
                 "Expected at least 2 calibration pairs with different parameters and "
-                f"groups; got {count}."
+                f"groups, from `append_calibration`; got {count}."
             )
         of_folds, self.seed = draw_seeds(seed, 2)
         self.folds = self.pairs.folds(num_folds, seed=of_folds)

@@ -179,7 +179,7 @@ def _trust(
         verdict_of(held_out.acauc) == "over-confident"
         and held_out.num_independent >= FEWEST
     ):
-        advice = "Collect more labels, or take intervals of a higher level than needed."
+        advice = "Collect more labels, or ask for intervals with `guaranteed=True`."
         lines.append((advice, True))
     wider = (
         f"These are scores of versions trained on {report.num_trained_on} pairs. Their "
@@ -218,7 +218,7 @@ def _sets(report: "StackingReport") -> list[tuple[str, bool]]:
     if scores is None or rank_needed(LEVEL, len(scores)) > len(scores):
         return []
     needed = scores.level_needed(LEVEL)
-    size = f"as large as {needed:.0%} sets"
+    size = f"as large as the posterior's own {needed:.0%} sets"
     if needed > ALL:
         size = "larger than almost all draws"
     return [
@@ -252,9 +252,9 @@ def _simulator(report: "StackingReport") -> list[tuple[str, bool]]:
     if found is None:
         return [
             (
-                "Not tested: entries of x are compared if x is a complete vector. "
-                "`DiscrepancyNPE.report(summaries=...)` compares summaries of series, "
-                "images and sets.",
+                "Not tested: x is no complete vector of at most 20 numbers, or no "
+                "discrepancy model is in the stack. `DiscrepancyNPE.from_posterior(...)"
+                ".report()` compares longer ones, and summaries of series and images.",
                 False,
             )
         ]

@@ -399,7 +399,10 @@ def test_default_candidates_have_different_names_and_can_keep_the_prior() -> Non
 
 def test_too_few_pairs_are_refused() -> None:
     theta, x = problem(6, seed=1)
-    with pytest.raises(NotReadyError, match=r"different parameters and groups; got 1"):
+    with pytest.raises(
+        NotReadyError,
+        match=r"different parameters and groups, from `append_calibration`; got 1",
+    ):
         stacked(rope_of((theta[:1].expand(6, -1), x)))
 
 

@@ -90,6 +90,14 @@ def test_exact_labels_among_others_give_sets_with_a_guarantee(tmp_path: Path) ->
         posterior.credible_set(0.9, x, guaranteed=True)
 
 
+def test_a_single_label_may_be_partial() -> None:
+    """Folds without it have as many draws of each label as the fold with it."""
+    theta = THETA.clone()
+    theta[0, 0] = math.nan
+    scores = validated(labelled(theta), candidates=[PRIOR, CANDIDATES[3]])
+    assert torch.isfinite(scores.log_scores).all()
+
+
 def test_labels_of_vanishing_noise_are_scored_like_exact_ones() -> None:
     exact = validated(labelled(THETA), candidates=[PRIOR, NPE])
     noisy = validated(labelled(THETA, theta_std=1e-5), candidates=[PRIOR, NPE])
