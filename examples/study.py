@@ -40,8 +40,6 @@ COLUMNS = (
     "n_calibration",
     "lpp",
     "lpp_z",
-    "lpp_median",
-    "neg_inf_fraction",
     "acauc",
     "expected_coverage_error",
     "seconds",
@@ -289,10 +287,10 @@ class ResultsFile:
 
 EXPLANATION = """
 LPP: mean log-probability of the true parameters, in standard deviations of the prior
-(higher is better). ACAUC: 0 is calibrated, above 0 is overconfident. ECE: expected
-coverage error. -inf: share of test observations with density zero. NPE and tuning-only
-are scored without sbi's leakage correction. SBI is NPE on simulations it has not seen.
-RoPE has one setting, fixed beforehand; stack weighs its rivals by held-out pairs.
+(higher is better). ACAUC: 0 is calibrated, above 0 is over-confident. ECE: expected
+coverage error. NPE and tuning-only are scored without sbi's leakage correction. SBI is
+NPE on simulations that it has not seen. RoPE has one setting, fixed beforehand; stack
+weighs its rivals by hold-out pairs.
 With several seeds: mean, and standard deviation of the LPP over seeds (+-).
 """
 
@@ -305,10 +303,10 @@ def print_table(rows: list[dict[str, Any]], *, explain: bool = True) -> None:
     frame = pd.DataFrame(rows)
     frame["method"] = pd.Categorical(frame["method"], order)
     groups = frame.groupby(["method", "n_calibration"], observed=True)
-    columns = ["lpp_z", "acauc", "expected_coverage_error", "neg_inf_fraction"]
+    columns = ["lpp_z", "acauc", "expected_coverage_error"]
     table = groups[columns].mean()
     table.insert(1, "+-", groups["lpp_z"].std())
-    table.columns = ["LPP", "+-", "ACAUC", "ECE", "-inf"]
+    table.columns = ["LPP", "+-", "ACAUC", "ECE"]
     table = table.rename_axis(["method", "pairs"]).reset_index()
     table["pairs"] = table["pairs"].replace({0: "-"})
     print(
