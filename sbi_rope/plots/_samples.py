@@ -183,6 +183,8 @@ def draw_contours(
     ends = zip(core.amin(dim=0).tolist(), core.amax(dim=0).tolist(), strict=True)
     x, y = np.meshgrid(*(np.linspace(*pair, GRID) for pair in ends))
     density = kernels(np.stack([x.ravel(), y.ravel()])).reshape(x.shape)
+    # There the density falls to zero, so that contours close along the edge.
+    x, y, density = np.pad(x, 1, "edge"), np.pad(y, 1, "edge"), np.pad(density, 1)
     # They are equal if most samples of discrete parameters are.
     levels = np.unique(np.quantile(kernels(kernels.dataset), 1 - np.array(shares)))
     colour, line = style["color"], style["linestyle"]
