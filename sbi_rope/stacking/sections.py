@@ -259,8 +259,9 @@ def _simulator(report: "StackingReport") -> list[tuple[str, bool]]:
             )
         ]
     off = [one for one in found.summaries if one.is_off]
+    notes = [(note, False) for note in found.notes]
     if not off:
-        return [("No entry of x shows a discrepancy.", False)]
+        return [("No entry of x shows a discrepancy.", False), *notes]
     worst = "; ".join(
         f"{one.name} by {one.size.median:.2g} (shift {one.shift.median:.2g}, gain "
         f"{one.gain.median:.2g})"
@@ -273,7 +274,8 @@ def _simulator(report: "StackingReport") -> list[tuple[str, bool]]:
             f"{'; and others' if len(off) > MAX_ENTRIES else ''}. Print "
             "`report.discrepancy` for intervals.",
             True,
-        )
+        ),
+        *notes,
     ]
 
 
