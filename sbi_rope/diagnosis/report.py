@@ -95,4 +95,4 @@ class Diagnosis:
 
 
 def _wrapped(text: str) -> str:
-    return textwrap.fill(text, 88, subsequent_indent="  ", break_on_hyphens=False)
+    return textwrap.fill(text, 80, subsequent_indent="  ", break_on_hyphens=False)

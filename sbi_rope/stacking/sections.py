@@ -73,7 +73,7 @@ def text_of(report: "StackingReport", sections: Sequence[Section]) -> str:
         lines.append(f"\n{title}")
         for text, _ in sentences:
             lines += textwrap.wrap(
-                text, 88, initial_indent="  ", subsequent_indent="    "
+                text, 80, initial_indent="  ", subsequent_indent="    "
             )
     made = report.provenance
     if made:

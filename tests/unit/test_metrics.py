@@ -202,11 +202,11 @@ def test_calibrated_ranks_of_ten_seldom_have_an_interval_without_zero(
 ) -> None:
     generator = torch.Generator().manual_seed(1)
     wrong = 0
-    for _ in range(1000):
+    for _ in range(3000):
         ranks = torch.rand(n, d, generator=generator).repeat(1, copies)
         wrong += verdict_of(scored(ranks).acauc) != "calibrated"
-    # In many more draws it is 4 to 5 %; with two standard errors it would be 8 %.
-    assert 0.02 < wrong / 1000 < 0.06
+    # In many more draws it is 4 to 5.5 %; with two standard errors it would be 8 %.
+    assert 0.02 < wrong / 3000 < 0.065
 
 
 def test_levels_too_large_are_over_confident_and_too_small_too_wide() -> None:
