@@ -373,8 +373,7 @@ class Evaluation:
     def __str__(self) -> str:
         n, d = self.ranks.shape
         lines = [
-            f"{n} observations with {d} true parameter{'s' * (d > 1)} each, means with "
-            "95% intervals",
+            f"Scores on {n} observation{'s' * (n > 1)} of {d} parameter{'s' * (d > 1)}",
             f"  LPP, the log density of the true parameters: {self.lpp:.2f} nats",
         ]
         if not math.isnan(self.lpp_z.mean):

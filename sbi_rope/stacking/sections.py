@@ -293,6 +293,7 @@ def _more_labels(report: "StackingReport") -> list[tuple[str, bool]]:
     for more in dict.fromkeys((FEW_MORE, curve.num_labels)):
         gain = curve.gain(more)
         if math.isfinite(gain.mean):
-            text = f"{more} more {kind} might add {gain:.2f} nats a pair."
+            text = f"{more} more {kind} might add {gain:.2f} nats a pair, if the curve "
+            text += "goes on like a - b / n."
             lines.append((text, False))
     return lines
