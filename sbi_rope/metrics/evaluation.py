@@ -373,7 +373,8 @@ class Evaluation:
     def __str__(self) -> str:
         n, d = self.ranks.shape
         lines = [
-            f"Scores on {n} observation{'s' * (n > 1)} of {d} parameter{'s' * (d > 1)}",
+            f"Scores on {n} observation{'s' * (n > 1)} of {d} "
+            f"parameter{'s' * (d > 1)}, with 95% intervals",
             f"  LPP, the log density of the true parameters: {self.lpp:.2f} nats",
         ]
         if not math.isnan(self.lpp_z.mean):
