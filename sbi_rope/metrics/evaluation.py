@@ -183,7 +183,7 @@ class Evaluation:
 
         The interval is wider than that of other means by :math:`\sqrt{n / (n - 1)}`.
         Without this factor, it would be too narrow for a few uniform levels. With it,
-        the interval leaves 0 out for 4 to 5.5 % of calibrated posteriors, with 10 to 50
+        the interval leaves 0 out for 4 to 5 % of calibrated posteriors, with 10 to 50
         observations and one to five parameters.
 
         References:

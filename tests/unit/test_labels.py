@@ -165,7 +165,7 @@ def test_the_density_of_draws_is_relative_to_that_of_the_prior() -> None:
 
 def test_ranks_of_noisy_labels_are_uniform_if_the_posterior_is_right() -> None:
     torch.manual_seed(0)
-    theta = gaussian.prior().sample((400,))
+    theta = gaussian.prior().sample((2000,))
     noise = torch.tensor([0.0, 0.8])
     labels = measured(theta + noise * torch.randn_like(theta), 0.0, 0.8)
     posterior: Any = gaussian.posterior()
@@ -173,7 +173,7 @@ def test_ranks_of_noisy_labels_are_uniform_if_the_posterior_is_right() -> None:
     unscored = (torch.zeros(len(x)), torch.zeros(len(x)))
     found = _score_labels(posterior, unscored, labels, x, seed=0)
     for uniform in found.ranks.T:
-        assert kstest(uniform.numpy(), "uniform").pvalue > 0.001
+        assert kstest(uniform.numpy(), "uniform").pvalue > 0.01
 
 
 # Learning -----------------------------------------------------------------------------
