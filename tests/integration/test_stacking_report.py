@@ -197,8 +197,11 @@ def test_estimates_and_ranks_are_those_of_hold_out_pairs() -> None:
     with quick(), patch("sbi_rope.stacking.scoring.NUM_SAMPLES", 400):
         report = stack(rope_of(), **DEFAULTS).report
     held_out, theta = report.held_out, rope_of().calibration[0]
-    agrees = (held_out.ranks > 0.5) == (theta > held_out.estimates)
-    assert float(agrees.double().mean()) > 0.8
+    # Of pairs in another order the correlation is 0.24.
+    above = torch.stack(
+        [held_out.ranks.flatten(), (theta - held_out.estimates).flatten()]
+    )
+    assert float(above.double().corrcoef()[0, 1]) > 0.7
 
 
 def test_the_text_says_what_to_do_about_over_confidence() -> None:
