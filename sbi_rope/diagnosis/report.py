@@ -74,6 +74,11 @@ class Diagnosis:
         return tuple(one for one in self.findings if one.alarming)
 
     @property
+    def ordered(self) -> tuple[Finding, ...]:
+        """The findings, alarms first."""
+        return tuple(sorted(self.findings, key=lambda one: not one.alarming))
+
+    @property
     def verdict(self) -> str:
         """How many alarms there are, such as "1 alarm in 10 tests."."""
         tests = sum(one.value is not None for one in self.findings)
@@ -90,8 +95,7 @@ class Diagnosis:
             f"Diagnosis of {count} observation{'s' * (count > 1)} against "
             f"{len(self.theta)} simulations: {self.verdict}"
         )
-        findings = sorted(self.findings, key=lambda one: not one.alarming)
-        return "\n".join([_wrapped(title), *map(str, findings)])
+        return "\n".join([_wrapped(title), *map(str, self.ordered)])
 
 
 def _wrapped(text: str) -> str:

@@ -144,10 +144,8 @@ def _parts(report: StackingReport, names: Sequence[str]) -> Iterable[_Part]:
 
 
 def _of_diagnosis(diagnosis: Diagnosis) -> _Part:
-    quiet = (one for one in diagnosis.findings if not one.alarming)
     lines = [
-        (f"{found.name}: {found.sentence}", found.alarming)
-        for found in (*diagnosis.alarming, *quiet)
+        (f"{one.name}: {one.sentence}", one.alarming) for one in diagnosis.findings
     ]
     picture = _encoded(implied_parameters(diagnosis))
     caption = "The parameters that the batch implies, beside the prior."
