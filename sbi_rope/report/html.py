@@ -144,9 +144,7 @@ def _parts(report: StackingReport, names: Sequence[str]) -> Iterable[_Part]:
 
 
 def _of_diagnosis(diagnosis: Diagnosis) -> _Part:
-    lines = [
-        (f"{one.name}: {one.sentence}", one.alarming) for one in diagnosis.findings
-    ]
+    lines = [(f"{one.name}: {one.sentence}", one.alarming) for one in diagnosis.ordered]
     picture = _encoded(implied_parameters(diagnosis))
     caption = "The parameters that the batch implies, beside the prior."
     return _Part("Diagnosis of the batch", lines, pictures=[(picture, caption)])
