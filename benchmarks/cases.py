@@ -17,9 +17,9 @@ from torch import Tensor
 
 from benchmarks.cells import Cell
 from benchmarks.presets import PRESETS, Settings
-from sbi_rope._files import write_atomically
 from sbi_rope.baselines import PlainNPE
 from sbi_rope.tasks import Task, get_task
+from sbi_rope.utils.files import write_atomically
 
 __all__ = ["Case", "Sources", "posterior_with", "state_of"]
 

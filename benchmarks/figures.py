@@ -17,8 +17,8 @@ from benchmarks.methods import METHODS, STACK
 from benchmarks.published import LETTERS, Published, finished, relative_ranks
 from benchmarks.store import WHERE, Results
 from sbi_rope import plots
-from sbi_rope._files import write_atomically
 from sbi_rope.plots._figures import empty_figure, hide_frame, new_figure, panel_grid
+from sbi_rope.utils.files import write_atomically
 
 __all__ = ["LPPAxis", "curves", "draw_all", "draw_overview", "rank_figure"]
 

@@ -28,9 +28,9 @@ from sbi_rope.baselines import (
     Training,
     TuningOnly,
 )
-from sbi_rope.discrepancy import DiscrepancyNPE
 from sbi_rope.discrepancy.correction import Space
-from sbi_rope.fit import History
+from sbi_rope.methods import DiscrepancyNPE
+from sbi_rope.training.fit import History
 
 if TYPE_CHECKING:
     from benchmarks.cases import Case

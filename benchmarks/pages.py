@@ -35,7 +35,7 @@ from benchmarks.published import (
     num_repetitions,
 )
 from benchmarks.store import Results
-from sbi_rope._files import write_atomically
+from sbi_rope.utils.files import write_atomically
 
 __all__ = ["BLOCK", "BLOCKS", "pages_with_blocks", "write_pages"]
 

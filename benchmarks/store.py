@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.cells import Cell
-from sbi_rope._files import write_atomically
+from sbi_rope.utils.files import write_atomically
 
 __all__ = ["WHERE", "Result", "Results"]
 

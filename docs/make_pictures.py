@@ -19,7 +19,7 @@ from sbi.neural_nets import posterior_nn
 from torch import Tensor
 
 from sbi_rope import RoPE, SinkhornCoupler, diagnose, plots, stack
-from sbi_rope.discrepancy import DiscrepancyNPE
+from sbi_rope.methods import DiscrepancyNPE
 from sbi_rope.metrics import draw_samples, evaluate
 from sbi_rope.tasks import get_task
 from sbi_rope.tasks.hemodynamics.population import PROCESSES, Population

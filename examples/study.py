@@ -26,11 +26,11 @@ from sbi_rope import (
     plots,
     stack,
 )
-from sbi_rope._files import write_atomically
 from sbi_rope.baselines import PriorPosterior
-from sbi_rope.discrepancy import DiscrepancyNPE
+from sbi_rope.methods import DiscrepancyNPE
 from sbi_rope.metrics import Evaluation, evaluate
 from sbi_rope.tasks import Task
+from sbi_rope.utils.files import write_atomically
 
 COLUMNS = (
     "task",

@@ -1,13 +1,14 @@
 """Robust posterior estimation for misspecified simulators, on top of sbi."""
 
 from sbi_rope.coupling import Coupling, SinkhornCoupler
+from sbi_rope.data.simulate import parallel
 from sbi_rope.density import MixturePosterior
 from sbi_rope.diagnosis import Diagnosis, diagnose
-from sbi_rope.finetuning import CalibrationFinetuner
-from sbi_rope.rope import RoPE
+from sbi_rope.rope.finetuning import CalibrationFinetuner
+from sbi_rope.rope.rope import RoPE
 from sbi_rope.saving import load, save
-from sbi_rope.simulate import parallel
 from sbi_rope.stacking import StackedPosterior, stack
+from sbi_rope.utils import errors as errors
 
 __all__ = [
     "CalibrationFinetuner",

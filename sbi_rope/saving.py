@@ -13,6 +13,7 @@ import pickle
 import zipfile
 from collections.abc import Sequence
 from dataclasses import is_dataclass
+from importlib.metadata import version
 from pathlib import Path
 from types import FunctionType, SimpleNamespace
 from typing import Any
@@ -25,10 +26,10 @@ from torch.distributions import Distribution, Transform
 from torch.distributions.constraints import Constraint
 from torch.serialization import get_unsafe_globals_in_checkpoint, safe_globals
 
-from sbi_rope._files import write_atomically
-from sbi_rope._sbi import BasePotential, NeuralPosterior
-from sbi_rope.errors import DataNotFoundError, FileFormatError
-from sbi_rope.settings import check
+from sbi_rope.npe.sbi import BasePotential, NeuralPosterior
+from sbi_rope.utils.errors import DataNotFoundError, FileFormatError
+from sbi_rope.utils.files import write_atomically
+from sbi_rope.utils.settings import check
 
 LAWS = (Distribution, Transform)
 BASES = (nn.Module, *LAWS, Constraint, NeuralPosterior, BasePotential)
@@ -44,8 +45,8 @@ ROOMS = (
 )
 # Dataclasses of these rooms are results. Others call what they hold, or run programs.
 RESULTS = (
-    *("sbi_rope._statistics.", "sbi_rope.baselines.", "sbi_rope.coupling."),
-    *("sbi_rope.data.Counts", "sbi_rope.sets.SetScores"),
+    *("sbi_rope.metrics.statistics.", "sbi_rope.baselines.", "sbi_rope.coupling."),
+    *("sbi_rope.data.pairs.Counts", "sbi_rope.density.sets.SetScores"),
     *("sbi_rope.discrepancy.", "sbi_rope.metrics.", "sbi_rope.stacking."),
     "sbi_rope.tasks.hemodynamics.prior_table.",
 )
@@ -236,6 +237,5 @@ class _Maker:
 
 
 def _versions() -> dict[str, str]:
-    ours = importlib.import_module("sbi_rope").__version__
-    versions = {"sbi": sbi.__version__, "sbi_rope": ours}
+    versions = {"sbi": sbi.__version__, "sbi_rope": version("sbi-rope")}
     return {name: ".".join(v.split(".")[:2]) for name, v in versions.items()}

@@ -16,8 +16,6 @@ from sbi.neural_nets import posterior_nn
 from torch import Tensor, nn
 
 from sbi_rope import CalibrationFinetuner
-from sbi_rope._random import seeded
-from sbi_rope._sbi import is_bounded
 from sbi_rope.baselines import (
     FMCPE,
     FRISBI,
@@ -38,9 +36,11 @@ from sbi_rope.baselines import (
     Training,
     TuningOnly,
 )
-from sbi_rope.discrepancy import DiscrepancyNPE
+from sbi_rope.methods import DiscrepancyNPE
+from sbi_rope.methods.base import Kind
+from sbi_rope.npe.sbi import is_bounded
 from sbi_rope.tasks import Task, get_task
-from sbi_rope.trainers.base import Kind
+from sbi_rope.utils.seeds import seeded
 from tests.conftest import SHARED_DATA
 
 VECTOR_TASKS = ("linear_gaussian", "light_tunnel_sensors")

@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-from sbi_rope.errors import RoPEError, shown
+from sbi_rope.utils.errors import RoPEError, shown
 
 __all__ = ["assert_refused"]
 

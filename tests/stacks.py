@@ -14,8 +14,7 @@ from sbi_rope import CalibrationFinetuner, RoPE, StackedPosterior
 from sbi_rope.density import Density, Prior
 from sbi_rope.discrepancy import DiscrepancyModel
 from sbi_rope.discrepancy.correction import TRAINING
-from sbi_rope.finetuning import FINETUNING
-from sbi_rope.fit import Training
+from sbi_rope.rope.finetuning import FINETUNING
 from sbi_rope.stacking import (
     Candidate,
     StackData,
@@ -24,6 +23,7 @@ from sbi_rope.stacking import (
     stack,
 )
 from sbi_rope.stacking.candidates import REHEARSED
+from sbi_rope.training.fit import Training
 from tests import problems
 
 QUIET: dict[str, Any] = {"show_progress_bars": False}
@@ -49,14 +49,14 @@ def quick() -> Iterator[None]:
         ),
         "stacking.candidates.FINETUNING": replace(FINETUNING, max_num_epochs=2),
         "stacking.candidates.REHEARSED": replace(REHEARSED, max_num_epochs=1),
-        "finetuning.STEPS_IN_EPOCH": 3,
+        "rope.finetuning.STEPS_IN_EPOCH": 3,
         "discrepancy.correction.TRAINING": dict.fromkeys(TRAINING, correcting),
         "discrepancy.correction.NUM_DRAWS": 50,
         "discrepancy.correction.NUM_COMPARED": 50,
         "discrepancy.unlabelled.SEARCH": Training(max_num_epochs=5),
         "discrepancy.unlabelled.NUM_HESSIANS": 1,
         "discrepancy.unlabelled.NUM_COMPONENTS": 5,
-        "fit.MAX_LOWERED": 0,
+        "training.fit.MAX_LOWERED": 0,
     }
     with ExitStack() as patches:
         for name, value in constants.items():

@@ -18,7 +18,7 @@ from sbi_rope.baselines.rnpe import RNPE
 from sbi_rope.baselines.rope_parts import OTOnly, TuningOnly
 from sbi_rope.baselines.rvnp import RVNP
 from sbi_rope.density import PriorPosterior
-from sbi_rope.trainers import FinetunedNPE, Method, Training
+from sbi_rope.methods import FinetunedNPE, Method, Training
 
 __all__ = [
     "FMCPE",

@@ -7,19 +7,17 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Independent, Normal
 
-from sbi_rope._random import seeded
-from sbi_rope._sbi import (
+from sbi_rope.baselines.networks import embedding_with_head, fit_rows
+from sbi_rope.data.pairs import split_pairs
+from sbi_rope.methods.base import Method
+from sbi_rope.npe.sbi import (
     ConditionalDensityEstimator,
     direct_posterior,
     embedding_of,
     leave_out_constants,
 )
-from sbi_rope.baselines.networks import embedding_with_head, fit_rows
-from sbi_rope.data import split_pairs
-from sbi_rope.fit import History, Training
-from sbi_rope.trainers.base import Method
-
-__all__ = ["CalibrationMLP", "DiagonalGaussian"]
+from sbi_rope.training.fit import History, Training
+from sbi_rope.utils.seeds import seeded
 
 # In standard deviations of the prior; a share of the held-out error; pairs.
 FARTHEST, FLOOR, PSEUDO_PAIRS = 5.0, 0.1, 2

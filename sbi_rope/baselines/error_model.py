@@ -8,10 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_rope._sbi import SliceSamplerVectorized
-from sbi_rope.settings import Positive, Settings, UnitInterval
-
-__all__ = ["BOUND", "SpikeAndSlab", "denoise", "split_r_hat"]
+from sbi_rope.npe.sbi import SliceSamplerVectorized
+from sbi_rope.utils.settings import Positive, Settings, UnitInterval
 
 # Draws of noise farther out are put here, since networks see them: 8e-5 of all.
 BOUND = 1e3

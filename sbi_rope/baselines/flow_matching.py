@@ -8,11 +8,9 @@ from sbi.utils import mcmc_transform
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
-from sbi_rope._prior import PriorDistribution
-from sbi_rope._random import seeded
-from sbi_rope._standardisation import ROUNDING
-
-__all__ = ["Standardise", "Unbounded", "VelocityField"]
+from sbi_rope.npe.prior import PriorDistribution
+from sbi_rope.npe.standardisation import ROUNDING
+from sbi_rope.utils.seeds import seeded
 
 # Units of each layer, and residual blocks.
 HIDDEN, NUM_BLOCKS = 64, 5

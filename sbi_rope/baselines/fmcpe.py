@@ -7,22 +7,20 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
-from sbi_rope._random import seeded
-from sbi_rope._sbi import ConditionalDensityEstimator, direct_posterior, embed
-from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope.baselines.flow_matching import Standardise, Unbounded, VelocityField
 from sbi_rope.baselines.networks import fit_rows, fresh_copy
 from sbi_rope.baselines.statistics import OverDraws, frozen_statistics
-from sbi_rope.data import split_pairs
+from sbi_rope.data.pairs import split_pairs
+from sbi_rope.data.simulate import draws
 from sbi_rope.density import Density
-from sbi_rope.ensemble import drawn
-from sbi_rope.fit import History, Training
-from sbi_rope.settings import Positive, check
-from sbi_rope.simulate import draws
-from sbi_rope.trainers.base import Method
-from sbi_rope.trainers.training import EstimatorBuilder
-
-__all__ = ["FMCPE"]
+from sbi_rope.methods.base import Method
+from sbi_rope.methods.training import EstimatorBuilder
+from sbi_rope.npe.sbi import ConditionalDensityEstimator, direct_posterior, embed
+from sbi_rope.npe.standardisation import warn_of_far_entries
+from sbi_rope.training.ensemble import drawn
+from sbi_rope.training.fit import History, Training
+from sbi_rope.utils.seeds import seeded
+from sbi_rope.utils.settings import Positive, check
 
 # The simulations like an observation that the density averages over, and those at the
 # parameters of each pair. Fewer are made if they are large.

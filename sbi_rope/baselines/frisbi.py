@@ -7,21 +7,19 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._sbi import ConditionalDensityEstimator, embed
-from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope.baselines.networks import fit_rows
 from sbi_rope.baselines.statistics import frozen_statistics
-from sbi_rope.data import split_pairs
+from sbi_rope.data.pairs import split_pairs
+from sbi_rope.data.simulate import targets
 from sbi_rope.density import Density, Flow, MixturePosterior, OverSimulations
-from sbi_rope.ensemble import Ensemble, embedded, log_density
-from sbi_rope.finetuning import trainable_copy
-from sbi_rope.fit import History, Training
-from sbi_rope.settings import Positive, check
-from sbi_rope.simulate import targets
-from sbi_rope.trainers.base import Method
-from sbi_rope.trainers.training import EstimatorBuilder
-
-__all__ = ["FRISBI"]
+from sbi_rope.methods.base import Method
+from sbi_rope.methods.training import EstimatorBuilder
+from sbi_rope.npe.sbi import ConditionalDensityEstimator, embed
+from sbi_rope.npe.standardisation import warn_of_far_entries
+from sbi_rope.rope.finetuning import trainable_copy
+from sbi_rope.training.ensemble import Ensemble, embedded, log_density
+from sbi_rope.training.fit import History, Training
+from sbi_rope.utils.settings import Positive, check
 
 # How the density is distilled.
 DISTILLING = Training(

@@ -6,8 +6,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_rope._random import seeded
-from sbi_rope._sbi import posterior_from
 from sbi_rope.baselines.hvae_model import (
     ConditionalUNet,
     ContinuedPrior,
@@ -16,15 +14,15 @@ from sbi_rope.baselines.hvae_model import (
 )
 from sbi_rope.baselines.networks import fit_rows
 from sbi_rope.baselines.statistics import OverDraws, frozen_statistics
-from sbi_rope.data import split_pairs
-from sbi_rope.ensemble import embedded
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.fit import History, Training
-from sbi_rope.settings import Count, check
-from sbi_rope.trainers.base import Method
-from sbi_rope.trainers.training import EstimatorBuilder
-
-__all__ = ["HVAE"]
+from sbi_rope.data.pairs import split_pairs
+from sbi_rope.methods.base import Method
+from sbi_rope.methods.training import EstimatorBuilder
+from sbi_rope.npe.sbi import posterior_from
+from sbi_rope.training.ensemble import embedded
+from sbi_rope.training.fit import History, Training
+from sbi_rope.utils.errors import InvalidInputError
+from sbi_rope.utils.seeds import seeded
+from sbi_rope.utils.settings import Count, check
 
 # Length of z, its draws behind the posterior, and behind the loss on held-out pairs.
 LATENT_DIM, NUM_LATENTS, NUM_LATENTS_HELD_OUT = 5, 64, 8

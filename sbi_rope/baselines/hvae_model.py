@@ -9,11 +9,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.distributions import Distribution, Independent, Normal, kl_divergence
 
-from sbi_rope._prior import PriorDistribution
-from sbi_rope._standardisation import ROUNDING
 from sbi_rope.baselines.networks import embedding_with_head
-
-__all__ = ["ConditionalUNet", "ContinuedPrior", "HybridVAE", "LatentEncoder"]
+from sbi_rope.npe.prior import PriorDistribution
+from sbi_rope.npe.standardisation import ROUNDING
 
 # Length over which the continued density falls by a factor of e, and how far inside
 # its ends the support is cut, in standard deviations of the prior. Some densities, that

@@ -6,14 +6,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_rope._sbi import direct_posterior, embedding_of
-from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope.baselines.networks import fit_rows
-from sbi_rope.data import split_pairs
-from sbi_rope.fit import History, Training
-from sbi_rope.trainers.base import Method
-
-__all__ = ["JointNPE"]
+from sbi_rope.data.pairs import split_pairs
+from sbi_rope.methods.base import Method
+from sbi_rope.npe.sbi import direct_posterior, embedding_of
+from sbi_rope.npe.standardisation import warn_of_far_entries
+from sbi_rope.training.fit import History, Training
 
 
 class JointNPE(Method):

@@ -6,10 +6,9 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from sbi_rope._sbi import embed
-from sbi_rope.fit import History, Training, epochs_on_pairs, fit, shuffled
-
-__all__ = ["embedding_with_head", "fit_rows", "fresh_copy"]
+from sbi_rope.data.pairs import epochs_on_pairs
+from sbi_rope.npe.sbi import embed
+from sbi_rope.training.fit import History, Training, fit, shuffled
 
 # Units of the hidden layers where an estimator has no embedding net of its own.
 HIDDEN = 64
@@ -64,7 +63,7 @@ def fit_rows(
     The mean loss is that of some rows, given their numbers. ``validation_loss`` takes
     the hold-out set, which may be empty, and is ``loss`` if None. Where too few pairs
     of parameters ``pairs`` leave none to hold out, it warns and makes few epochs. Other
-    options are those of :func:`~sbi_rope.fit.fit`.
+    options are those of :func:`~sbi_rope.training.fit.fit`.
     """
     rows, held_out = split
     score = validation_loss or loss

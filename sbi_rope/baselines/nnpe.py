@@ -4,15 +4,13 @@ from typing import Any
 
 from torch import Tensor
 
-from sbi_rope._sbi import embed, posterior_from
 from sbi_rope.baselines.error_model import SpikeAndSlab
 from sbi_rope.baselines.statistics import NoiseOn, clipped_statistics
-from sbi_rope.fit import History, Training
-from sbi_rope.settings import check
-from sbi_rope.trainers.base import Method
-from sbi_rope.trainers.training import EstimatorBuilder, train_on_simulations
-
-__all__ = ["NNPE"]
+from sbi_rope.methods.base import Method
+from sbi_rope.methods.training import EstimatorBuilder, train_on_simulations
+from sbi_rope.npe.sbi import embed, posterior_from
+from sbi_rope.training.fit import History, Training
+from sbi_rope.utils.settings import check
 
 
 class NNPE(Method):

@@ -11,13 +11,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_rope._random import seeded
+from sbi_rope.data.simulate import Simulated
 from sbi_rope.density import PriorPosterior
-from sbi_rope.fit import History
-from sbi_rope.simulate import Simulated
-from sbi_rope.trainers.base import Method
-
-__all__ = ["PlainNPE", "PriorBaseline", "ReferenceNPE"]
+from sbi_rope.methods.base import Method
+from sbi_rope.training.fit import History
+from sbi_rope.utils.seeds import seeded
 
 
 class PriorBaseline(Method):

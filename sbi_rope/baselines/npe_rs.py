@@ -5,14 +5,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_rope._sbi import direct_posterior, embedding_of
-from sbi_rope.errors import warn_user
-from sbi_rope.fit import History, Training
-from sbi_rope.settings import NotNegative, check
-from sbi_rope.trainers.base import Method
-from sbi_rope.trainers.training import EstimatorBuilder, train_on_simulations
-
-__all__ = ["NPERS", "squared_mmd"]
+from sbi_rope.methods.base import Method
+from sbi_rope.methods.training import EstimatorBuilder, train_on_simulations
+from sbi_rope.npe.sbi import direct_posterior, embedding_of
+from sbi_rope.training.fit import History, Training
+from sbi_rope.utils.errors import warn_user
+from sbi_rope.utils.settings import NotNegative, check
 
 # Simulations, and observations, behind the discrepancy of each step, if there are so
 # many.

@@ -1,10 +1,8 @@
 r"""Regression of parameters on real observations, without a simulator."""
 
 from sbi_rope.density import GaussianProcess, MixturePosterior
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.trainers.base import Method
-
-__all__ = ["Regression"]
+from sbi_rope.methods.base import Method
+from sbi_rope.utils.errors import InvalidInputError
 
 
 class Regression(Method):

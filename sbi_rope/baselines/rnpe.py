@@ -5,15 +5,6 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._random import seeded
-from sbi_rope._sbi import (
-    ConditionalDensityEstimator,
-    build_zuko_unconditional_flow,
-    direct_posterior,
-    embed,
-    estimator_of,
-)
-from sbi_rope._standardisation import Standardisation
 from sbi_rope.baselines.error_model import BOUND, SpikeAndSlab, denoise
 from sbi_rope.baselines.statistics import (
     NoiseOn,
@@ -22,14 +13,21 @@ from sbi_rope.baselines.statistics import (
     split_at_statistics,
     standardisation_of_statistics,
 )
-from sbi_rope.errors import warn_user
-from sbi_rope.fit import History, Training
-from sbi_rope.settings import Count, Range, check
-from sbi_rope.tensors import as_batch
-from sbi_rope.trainers.base import Method
-from sbi_rope.trainers.training import EstimatorBuilder
-
-__all__ = ["RNPE", "Denoised"]
+from sbi_rope.methods.base import Method
+from sbi_rope.methods.training import EstimatorBuilder
+from sbi_rope.npe.sbi import (
+    ConditionalDensityEstimator,
+    build_zuko_unconditional_flow,
+    direct_posterior,
+    embed,
+    estimator_of,
+)
+from sbi_rope.npe.standardisation import Standardisation
+from sbi_rope.training.fit import History, Training
+from sbi_rope.utils.errors import warn_user
+from sbi_rope.utils.seeds import seeded
+from sbi_rope.utils.settings import Count, Range, check
+from sbi_rope.utils.tensors import as_batch
 
 # Chains that disagree by more have not converged.
 MAX_R_HAT = 1.1

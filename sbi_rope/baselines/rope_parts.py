@@ -9,13 +9,11 @@ from typing import Any
 
 from sbi_rope.coupling import SinkhornCoupler
 from sbi_rope.density import MixturePosterior
-from sbi_rope.finetuning import CalibrationFinetuner
-from sbi_rope.fit import History
-from sbi_rope.rope import RoPE
-from sbi_rope.trainers.base import Method
-from sbi_rope.trainers.training import EstimatorBuilder
-
-__all__ = ["OTOnly", "TuningOnly"]
+from sbi_rope.methods.base import Method
+from sbi_rope.methods.training import EstimatorBuilder
+from sbi_rope.rope.finetuning import CalibrationFinetuner
+from sbi_rope.rope.rope import RoPE
+from sbi_rope.training.fit import History
 
 
 class TuningOnly(Method):

@@ -13,9 +13,6 @@ from torch.distributions import (
     MultivariateNormal,
 )
 
-from sbi_rope._random import seeded
-from sbi_rope._sbi import embed, gaussians_of, posterior_from
-from sbi_rope._standardisation import Standardisation
 from sbi_rope.baselines.networks import fit_rows
 from sbi_rope.baselines.statistics import (
     NoiseOn,
@@ -23,14 +20,15 @@ from sbi_rope.baselines.statistics import (
     fit_with_jitter,
     standardisation_of_statistics,
 )
-from sbi_rope.data import split_pairs
-from sbi_rope.fit import History, Training
-from sbi_rope.settings import check
-from sbi_rope.tensors import as_batch
-from sbi_rope.trainers.base import Method
-from sbi_rope.trainers.training import EstimatorBuilder
-
-__all__ = ["RVNP"]
+from sbi_rope.data.pairs import split_pairs
+from sbi_rope.methods.base import Method
+from sbi_rope.methods.training import EstimatorBuilder
+from sbi_rope.npe.sbi import embed, gaussians_of, posterior_from
+from sbi_rope.npe.standardisation import Standardisation
+from sbi_rope.training.fit import History, Training
+from sbi_rope.utils.seeds import seeded
+from sbi_rope.utils.settings import check
+from sbi_rope.utils.tensors import as_batch
 
 # K, the share of the draws that come from the prior, and lambda.
 NUM_DRAWS, SHARE_OF_PRIOR, SHRINKAGE = 32, 0.25, 0.1

@@ -6,7 +6,10 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._sbi import (
+from sbi_rope.baselines.networks import fit_rows
+from sbi_rope.data.pairs import split_pairs
+from sbi_rope.density import Density, Flow
+from sbi_rope.npe.sbi import (
     ConditionalDensityEstimator,
     check_density,
     embed,
@@ -15,24 +18,10 @@ from sbi_rope._sbi import (
     headless,
     with_embedding,
 )
-from sbi_rope._standardisation import Standardisation
-from sbi_rope.baselines.networks import fit_rows
-from sbi_rope.data import split_pairs
-from sbi_rope.density import Density, Flow
-from sbi_rope.ensemble import Ensemble, embedded, log_density
-from sbi_rope.fit import History, Training
-from sbi_rope.tensors import as_batch
-
-__all__ = [
-    "NoiseOn",
-    "OverDraws",
-    "SoftClip",
-    "clipped_statistics",
-    "fit_with_jitter",
-    "frozen_statistics",
-    "split_at_statistics",
-    "standardisation_of_statistics",
-]
+from sbi_rope.npe.standardisation import Standardisation
+from sbi_rope.training.ensemble import Ensemble, embedded, log_density
+from sbi_rope.training.fit import History, Training
+from sbi_rope.utils.tensors import as_batch
 
 NoiseOn = Literal["embedding", "input"]
 # Where the logarithmic scale begins, in standard deviations, and the smallest of those.
@@ -157,7 +146,7 @@ def fit_with_jitter(
 
     Gaussian noise on them is drawn anew for every batch; ``jitter`` is its standard
     deviation. Without noise, statistics that depend on each other have no density.
-    Other options are those of :func:`~sbi_rope.fit.fit`.
+    Other options are those of :func:`~sbi_rope.training.fit.fit`.
     """
 
     def loss(rows: Tensor) -> Tensor:

@@ -15,9 +15,9 @@ from sbi_rope.coupling.sinkhorn import (
     solve_fixed_point,
     solve_pot,
 )
-from sbi_rope.errors import CouplingError, warn_user
-from sbi_rope.settings import Count, Positive, Settings, UnitInterval
-from sbi_rope.tensors import as_batch
+from sbi_rope.utils.errors import CouplingError, warn_user
+from sbi_rope.utils.settings import Count, Positive, Settings, UnitInterval
+from sbi_rope.utils.tensors import as_batch
 
 # With fewer observations than this, few of them decide how the coupling is balanced.
 SMALL_BATCH = 20

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
-from sbi_rope._prior import PriorDistribution
-from sbi_rope._random import seeded
-from sbi_rope._sbi import ConditionalDensityEstimator
-from sbi_rope.errors import InvalidInputError, warn_user
+from sbi_rope.npe.prior import PriorDistribution
+from sbi_rope.npe.sbi import ConditionalDensityEstimator
+from sbi_rope.utils.errors import InvalidInputError, warn_user
+from sbi_rope.utils.seeds import seeded
 
 # sbi converts every x to this dtype, and its estimators work in no other.
 DTYPE = torch.float32

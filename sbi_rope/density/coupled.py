@@ -9,8 +9,6 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._sbi import ConditionalDensityEstimator, embed, readable
-from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope.coupling import Coupling
 from sbi_rope.density.base import (
     Accept,
@@ -20,8 +18,10 @@ from sbi_rope.density.base import (
     without_nan,
     without_nan_gradients,
 )
-from sbi_rope.ensemble import drawn, log_density
-from sbi_rope.errors import InvalidInputError, warn_user
+from sbi_rope.npe.sbi import ConditionalDensityEstimator, embed, readable
+from sbi_rope.npe.standardisation import warn_of_far_entries
+from sbi_rope.training.ensemble import drawn, log_density
+from sbi_rope.utils.errors import InvalidInputError, warn_user
 
 
 class OverSimulations(Density):

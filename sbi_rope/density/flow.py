@@ -8,15 +8,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._random import seeded
-from sbi_rope._sbi import (
-    ConditionalEstimator,
-    embedding_of,
-    has_parameters,
-    headless,
-    readable,
-    with_embedding,
-)
 from sbi_rope.density.base import (
     Density,
     batches,
@@ -24,7 +15,16 @@ from sbi_rope.density.base import (
     without_nan,
     without_nan_gradients,
 )
-from sbi_rope.ensemble import Ensemble, drawn, embedded, log_density, loss_of
+from sbi_rope.npe.sbi import (
+    ConditionalEstimator,
+    embedding_of,
+    has_parameters,
+    headless,
+    readable,
+    with_embedding,
+)
+from sbi_rope.training.ensemble import Ensemble, drawn, embedded, log_density, loss_of
+from sbi_rope.utils.seeds import seeded
 
 # Observations in one call of the embedding nets.
 NET_BATCH = 1000

@@ -8,14 +8,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._prior import PriorDistribution
-from sbi_rope._random import seeded
-from sbi_rope._sbi import check_density, estimator_of
 from sbi_rope.density.base import Accept, Density
 from sbi_rope.density.flow import Flow
 from sbi_rope.density.posterior import MixturePosterior
-from sbi_rope.errors import InvalidInputError, shown
-from sbi_rope.settings import check
+from sbi_rope.npe.prior import PriorDistribution
+from sbi_rope.npe.sbi import check_density, estimator_of
+from sbi_rope.utils.errors import InvalidInputError, shown
+from sbi_rope.utils.seeds import seeded
+from sbi_rope.utils.settings import check
 
 # Draws of the first prior, at which the others must have the same density.
 NUM_FROM_PRIOR = 100

@@ -4,18 +4,12 @@ import copy
 import operator
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_rope._prior import PriorDistribution
-from sbi_rope._progress import is_shown, progress_bar
-from sbi_rope._random import seeded
-from sbi_rope._sbi import BaseDirectPosterior, MixedDensity
-from sbi_rope._standardisation import warn_of_far_entries
 from sbi_rope.coupling import Coupling
 from sbi_rope.density.base import (
     DTYPE,
@@ -26,11 +20,15 @@ from sbi_rope.density.base import (
     num_fitting,
 )
 from sbi_rope.density.coupled import Coupled
-from sbi_rope.errors import InvalidInputError, SamplingError
-from sbi_rope.saving import save
-from sbi_rope.sets import MakesSets
-from sbi_rope.settings import Count, Positive, check
-from sbi_rope.tensors import as_batch, as_numbers, rows_with
+from sbi_rope.density.sets import MakesSets
+from sbi_rope.npe.prior import PriorDistribution
+from sbi_rope.npe.sbi import BaseDirectPosterior, MixedDensity
+from sbi_rope.npe.standardisation import warn_of_far_entries
+from sbi_rope.utils.errors import InvalidInputError, SamplingError
+from sbi_rope.utils.progress import is_shown, progress_bar
+from sbi_rope.utils.seeds import seeded
+from sbi_rope.utils.settings import Count, Positive, check
+from sbi_rope.utils.tensors import as_batch, as_numbers, rows_with
 
 # An observation is slow if, after MIN_PROPOSALS proposals, less than a share of
 # MIN_ACCEPTANCE of them lies inside the prior's support. Rejection sampling gives up on
@@ -180,10 +178,6 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         self._set_up(density, self.prior, self.enable_transform)
         if x is not None:
             self._keep_default_x(x)
-
-    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Write this posterior to a file, as :func:`sbi_rope.save` does."""
-        save(self, path, overwrite=overwrite)
 
     # --- arguments ---
 

@@ -10,8 +10,8 @@ from scipy.optimize import minimize
 from torch import Tensor, nn
 from torch.distributions import Chi2
 
-from sbi_rope._sbi import embed
 from sbi_rope.density.base import Density
+from sbi_rope.npe.sbi import embed
 
 # More entries than these are reduced to principal components, at most so many.
 MAX_ENTRIES, MAX_COMPONENTS = 20, 10

@@ -7,9 +7,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from sbi_rope._progress import is_shown
-from sbi_rope._random import seeded
-from sbi_rope._statistics import compare_with_pairs
+from sbi_rope.data.parameters import is_improbable
 from sbi_rope.density import MixturePosterior
 from sbi_rope.diagnosis.misspecification import (
     after_tuning,
@@ -25,13 +23,12 @@ from sbi_rope.diagnosis.prior_shift import prior_shift, shifts
 from sbi_rope.diagnosis.report import Diagnosis, Finding
 from sbi_rope.diagnosis.residuals import cross_fit, residual_finding
 from sbi_rope.diagnosis.simulations import Simulations
-from sbi_rope.discrepancy.parameters import is_improbable
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.rope import RoPE
-from sbi_rope.settings import Range, check, default_names, names_of
-from sbi_rope.stacking import StackedPosterior
-
-__all__ = ["diagnose"]
+from sbi_rope.metrics.statistics import compare_with_pairs
+from sbi_rope.rope.rope import RoPE
+from sbi_rope.utils.errors import InvalidInputError
+from sbi_rope.utils.progress import is_shown
+from sbi_rope.utils.seeds import seeded
+from sbi_rope.utils.settings import Range, check, default_names, names_of
 
 # With fewer simulations the thresholds cannot be estimated.
 FEWEST_SIMULATIONS = 100
@@ -140,7 +137,7 @@ def diagnose(
             *shifts(shift, simulations, names, learned),
             before_tuning(before, tuned=tuned),
         ]
-        if isinstance(posterior, StackedPosterior):
+        if hasattr(posterior, "report"):  # a stack, which does without a coupling
             if far.value is None:  # so that a single broken observation is found
                 findings.append(unmatched(distance, len(simulated)))
         else:
@@ -168,9 +165,8 @@ def diagnose(
 
 def _has_learned(posterior: MixturePosterior | None) -> bool:
     """Tell whether it is a stack that learned other parameters than the prior's."""
-    if not isinstance(posterior, StackedPosterior):
+    if (report := getattr(posterior, "report", None)) is None:
         return False
-    report = posterior.report
     learns = len(report.keep_prior) < len(report.names)
     return learns and is_improbable(report.probability_of_prior)
 

@@ -7,23 +7,12 @@ import torch
 from scipy.stats import binom
 from torch import Tensor, nn
 
-from sbi_rope._sbi import squared_mmd
-from sbi_rope._standardisation import FAR, deviations
-from sbi_rope._statistics import LEVEL, TwoSampleTest
 from sbi_rope.coupling import Coupling
 from sbi_rope.diagnosis.report import UNLIKE_PAIRS, Finding
 from sbi_rope.diagnosis.simulations import Simulations, nearest_distances
-
-__all__ = [
-    "after_tuning",
-    "before_tuning",
-    "distances",
-    "effective_sizes",
-    "far_entries",
-    "mmd_test",
-    "unlike_pairs",
-    "unmatched",
-]
+from sbi_rope.metrics.statistics import LEVEL, TwoSampleTest
+from sbi_rope.npe.sbi import squared_mmd
+from sbi_rope.npe.standardisation import FAR, deviations
 
 # The most observations and simulations in one MMD, whose cost is quadratic.
 MAX_OBSERVATIONS, MAX_SIMULATIONS = 200, 400

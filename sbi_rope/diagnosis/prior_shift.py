@@ -6,14 +6,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from sbi_rope._prior import divisors
-from sbi_rope._statistics import LEVEL
 from sbi_rope.coupling import SinkhornCoupler
 from sbi_rope.diagnosis.report import Finding
 from sbi_rope.diagnosis.residuals import HeldOut
 from sbi_rope.diagnosis.simulations import Simulations, implied_by, resampled
-
-__all__ = ["prior_shift", "shifts"]
+from sbi_rope.metrics.statistics import LEVEL
+from sbi_rope.utils.tensors import divisors
 
 # At tau = 0 each observation is coupled by itself, without trust in the prior. The
 # smaller gamma is, the less the implied distribution is blurred.

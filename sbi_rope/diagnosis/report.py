@@ -5,8 +5,6 @@ from dataclasses import dataclass, field
 
 from torch import Tensor
 
-__all__ = ["UNLIKE_PAIRS", "Diagnosis", "Finding"]
-
 UNLIKE_PAIRS = "batch unlike the calibration pairs"
 
 

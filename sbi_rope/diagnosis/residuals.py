@@ -5,17 +5,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from sbi_rope._prior import divisors
-from sbi_rope._progress import progress_bar
-from sbi_rope._sbi import embed
-from sbi_rope._statistics import LEVEL, permutation_test
-from sbi_rope.data import Pairs, one_of_each_group
+from sbi_rope.data.pairs import Pairs, one_of_each_group, without_warning_of_few_pairs
 from sbi_rope.diagnosis.report import Finding
 from sbi_rope.diagnosis.simulations import Simulations
-from sbi_rope.fit import without_warning_of_few_pairs
-from sbi_rope.rope import RoPE
-
-__all__ = ["HeldOut", "bias_finding", "cross_fit", "dependence", "residual_finding"]
+from sbi_rope.metrics.statistics import LEVEL, permutation_test
+from sbi_rope.npe.sbi import embed
+from sbi_rope.rope.rope import RoPE
+from sbi_rope.utils.progress import progress_bar
+from sbi_rope.utils.tensors import divisors
 
 NAME = "residual depends on parameters"
 # Averaging over the simulator's noise explains at most this, see `bias_finding`.

@@ -6,10 +6,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from sbi_rope._prior import divisors
 from sbi_rope.coupling import Coupling
-
-__all__ = ["Simulations", "implied_by", "nearest_distances", "resampled"]
+from sbi_rope.utils.tensors import divisors
 
 # Points at which distribution functions are compared.
 NUM_POINTS = 100

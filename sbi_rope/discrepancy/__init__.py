@@ -1,8 +1,7 @@
-"""A model of how reality differs from a simulator, and an NPE trained with it."""
+"""A model of how reality differs from a simulator, and corrections with it."""
 
+from sbi_rope.data.parameters import ParameterDistribution, learn_parameters
 from sbi_rope.discrepancy.model import DiscrepancyModel
-from sbi_rope.discrepancy.npe import DiscrepancyNPE
-from sbi_rope.discrepancy.parameters import ParameterDistribution, learn_parameters
 from sbi_rope.discrepancy.posterior import Discrepancy, DiscrepancyDraws
 from sbi_rope.discrepancy.report import DiscrepancyReport, Interval, SummaryDiscrepancy
 
@@ -10,7 +9,6 @@ __all__ = [
     "Discrepancy",
     "DiscrepancyDraws",
     "DiscrepancyModel",
-    "DiscrepancyNPE",
     "DiscrepancyReport",
     "Interval",
     "ParameterDistribution",

@@ -8,13 +8,11 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._random import seeded
-from sbi_rope._sbi import ConditionalEstimator, embedding_of, has_parameters
-from sbi_rope._standardisation import Standardisation
-from sbi_rope.data import Pairs, group_means, groups_of
+from sbi_rope.data.pairs import Pairs, group_means, groups_of
+from sbi_rope.data.parameters import learn_parameters
+from sbi_rope.data.simulate import Moments
 from sbi_rope.density.flow import Flow
 from sbi_rope.discrepancy.model import DiscrepancyModel, expected_means
-from sbi_rope.discrepancy.parameters import learn_parameters
 from sbi_rope.discrepancy.posterior import (
     SMALLEST_ERROR,
     Discrepancy,
@@ -22,22 +20,11 @@ from sbi_rope.discrepancy.posterior import (
     rounding,
 )
 from sbi_rope.discrepancy.unlabelled import LaplaceDiscrepancy
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.fit import Courses, History, Training, fit
-from sbi_rope.simulate import Moments
-
-__all__ = [
-    "Correction",
-    "SimulatedConstants",
-    "Space",
-    "correct_flow",
-    "fit_discrepancy",
-    "fit_version",
-    "in_units",
-    "network_of",
-    "surprise",
-    "tuning_targets",
-]
+from sbi_rope.npe.sbi import ConditionalEstimator, embedding_of, has_parameters
+from sbi_rope.npe.standardisation import Standardisation
+from sbi_rope.training.fit import Courses, History, Training, fit
+from sbi_rope.utils.errors import InvalidInputError
+from sbi_rope.utils.seeds import seeded
 
 # What is corrected: h(x), x itself, or g(x) with nets g tuned on other pairs. In the
 # last case simulations are still represented by h(x), because g is tuned towards h.

@@ -11,8 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_rope._random import seeded
-from sbi_rope.data import groups_of
+from sbi_rope.data.pairs import groups_of
 from sbi_rope.discrepancy.posterior import Discrepancy, rounding
 from sbi_rope.discrepancy.regression import (
     Conditional,
@@ -21,10 +20,9 @@ from sbi_rope.discrepancy.regression import (
     independent_pairs,
     log_density_of_right,
 )
-from sbi_rope.settings import Settings, UnitInterval
-from sbi_rope.tensors import as_batch
-
-__all__ = ["DiscrepancyModel", "expected_means"]
+from sbi_rope.utils.seeds import seeded
+from sbi_rope.utils.settings import Settings, UnitInterval
+from sbi_rope.utils.tensors import as_batch
 
 # Ratios of the variance between groups to the one within them, and their prior. Those
 # below .2 matter for large groups only; together they are as probable as another one.

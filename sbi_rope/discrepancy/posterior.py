@@ -7,17 +7,8 @@ import torch
 from torch import Tensor
 from torch.distributions import Chi2
 
-from sbi_rope._random import seeded
-from sbi_rope.tensors import as_batch
-
-__all__ = [
-    "SMALLEST_ERROR",
-    "Discrepancy",
-    "DiscrepancyDraws",
-    "Term",
-    "noise_scale",
-    "rounding",
-]
+from sbi_rope.utils.seeds import seeded
+from sbi_rope.utils.tensors import as_batch
 
 # Entries of the matrices that simulations are corrected by at a time.
 MAX_ENTRIES = 2**22

@@ -11,8 +11,6 @@ from torch.distributions import MultivariateNormal
 
 from sbi_rope.discrepancy.posterior import Discrepancy, Term, noise_scale, rounding
 
-__all__ = ["Conditional", "GroupErrors", "Regressions", "independent_pairs"]
-
 # The prior precision of the offset is this share of the precision of the gain.
 OFFSET_PRECISION = 1 / 3
 # The prior precision of the gain is at least this times the noise C of each entry and

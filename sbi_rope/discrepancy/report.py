@@ -8,14 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_rope._progress import progress_bar
-from sbi_rope._standardisation import Standardisation
+from sbi_rope.data.simulate import Moments
 from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.posterior import Discrepancy
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.simulate import Moments
-
-__all__ = ["DiscrepancyReport", "Interval", "SummaryDiscrepancy", "report_discrepancy"]
+from sbi_rope.npe.standardisation import Standardisation
+from sbi_rope.utils.errors import InvalidInputError
+from sbi_rope.utils.progress import progress_bar
 
 NUM_DRAWS = 4000
 # A progress bar appears after this many seconds.

@@ -8,17 +8,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._random import seeded
+from sbi_rope.data.simulate import Moments
 from sbi_rope.discrepancy.posterior import (
     SMALLEST_ERROR,
     DiscrepancyDraws,
     noise_scale,
 )
-from sbi_rope.errors import warn_user
-from sbi_rope.fit import Training, fit
-from sbi_rope.simulate import Moments
-
-__all__ = ["LaplaceDiscrepancy", "Marginal", "fit_unlabelled"]
+from sbi_rope.training.fit import Training, fit
+from sbi_rope.utils.errors import warn_user
+from sbi_rope.utils.seeds import seeded
 
 # Gaussians that the marginal density of simulations mixes, fitted to so many.
 NUM_COMPONENTS, NUM_FITTED = 25, 8000

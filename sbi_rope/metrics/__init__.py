@@ -5,8 +5,8 @@ of any posterior that has ``sample_batched`` and ``log_prob_batched``. The test 
 consists of ``theta``, shape ``(n, d)``, and ``x``, shape ``(n, *event_shape)``.
 """
 
-from sbi_rope._statistics import Estimate
 from sbi_rope.metrics.calls import draw_samples
 from sbi_rope.metrics.evaluation import Dependence, Evaluation, evaluate
+from sbi_rope.metrics.statistics import Estimate
 
 __all__ = ["Dependence", "Estimate", "Evaluation", "draw_samples", "evaluate"]

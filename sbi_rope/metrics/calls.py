@@ -16,24 +16,15 @@ import torch
 from sbi.inference import DirectPosterior, EnsemblePosterior, VectorFieldPosterior
 from torch import Tensor, nn
 
-from sbi_rope._progress import progress_bar
-from sbi_rope._sbi import NeuralPosterior, is_bounded, readable
 from sbi_rope.density import Density, MixturePosterior, PriorPosterior
-from sbi_rope.errors import (
+from sbi_rope.npe.sbi import NeuralPosterior, is_bounded, readable
+from sbi_rope.utils.errors import (
     InvalidInputError,
     LogProbUnavailableError,
 )
-from sbi_rope.settings import Count, Range, check
-from sbi_rope.tensors import as_batch, as_numbers, rows_with
-
-__all__ = [
-    "CHUNK_SIZE",
-    "NumSamples",
-    "draw_chunks",
-    "draw_samples",
-    "evaluate_log_probs",
-    "read_test_set",
-]
+from sbi_rope.utils.progress import progress_bar
+from sbi_rope.utils.settings import Count, Range, check
+from sbi_rope.utils.tensors import as_batch, as_numbers, rows_with
 
 # How many observations a posterior is called with at a time, unless the user says.
 CHUNK_SIZE = 100

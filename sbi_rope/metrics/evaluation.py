@@ -11,10 +11,12 @@ import torch
 from scipy.stats import rankdata
 from torch import Tensor
 
-from sbi_rope._prior import PriorDistribution
-from sbi_rope._random import seeded
-from sbi_rope._statistics import Estimate, permutation_test
-from sbi_rope.data import effective_number, group_means, groups_of, one_of_each_group
+from sbi_rope.data.pairs import (
+    effective_number,
+    group_means,
+    groups_of,
+    one_of_each_group,
+)
 from sbi_rope.metrics.calls import (
     CHUNK_SIZE,
     NumSamples,
@@ -22,19 +24,11 @@ from sbi_rope.metrics.calls import (
     evaluate_log_probs,
     read_test_set,
 )
-from sbi_rope.settings import Positive, check, default_names
-from sbi_rope.tensors import as_batch
-
-__all__ = [
-    "FEWEST",
-    "LEVEL",
-    "Dependence",
-    "Evaluation",
-    "Verdict",
-    "estimates_and_ranks",
-    "evaluate",
-    "verdict_of",
-]
+from sbi_rope.metrics.statistics import Estimate, permutation_test
+from sbi_rope.npe.prior import PriorDistribution
+from sbi_rope.utils.seeds import seeded
+from sbi_rope.utils.settings import Positive, check, default_names
+from sbi_rope.utils.tensors import as_batch
 
 # The level of the intervals whose coverage is stated.
 LEVEL = 0.9

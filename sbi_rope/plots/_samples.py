@@ -10,8 +10,8 @@ from scipy.stats import gaussian_kde
 from torch import Tensor
 
 from sbi_rope.plots._figures import PRIOR, hide_frame, line_styles
-from sbi_rope.settings import names_of
-from sbi_rope.tensors import as_batch
+from sbi_rope.utils.settings import names_of
+from sbi_rope.utils.tensors import as_batch
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

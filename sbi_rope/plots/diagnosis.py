@@ -14,13 +14,11 @@ from sbi_rope.plots._figures import (
     hide_frame,
 )
 from sbi_rope.plots._samples import central_interval, with_margin
-from sbi_rope.settings import check
+from sbi_rope.utils.settings import check
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-__all__ = ["implied_parameters"]
 
 NUM_BINS = 20
 MAX_COLUMNS = 4

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from sbi_rope.coupling import Coupling
 from sbi_rope.discrepancy import DiscrepancyReport
-from sbi_rope.finetuning import History
 from sbi_rope.metrics import Evaluation
 from sbi_rope.metrics.evaluation import LEVEL, NOMINAL
 from sbi_rope.plots._figures import (
@@ -26,7 +25,8 @@ from sbi_rope.plots._figures import (
     panel_grid,
 )
 from sbi_rope.plots._samples import as_drawn, central_interval
-from sbi_rope.settings import names_of
+from sbi_rope.rope.finetuning import History
+from sbi_rope.utils.settings import names_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

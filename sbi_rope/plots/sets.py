@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from sbi_rope.density import MixturePosterior
-from sbi_rope.errors import InvalidInputError, warn_user
 from sbi_rope.plots._figures import BLUE, GREY, ORANGE, empty_figure
 from sbi_rope.plots._samples import (
     as_samples,
@@ -18,6 +17,7 @@ from sbi_rope.plots._samples import (
     with_margin,
 )
 from sbi_rope.stacking import StackedPosterior
+from sbi_rope.utils.errors import InvalidInputError, warn_user
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -14,15 +14,13 @@ from sbi_rope.plots._figures import (
     empty_figure,
     hide_frame,
 )
-from sbi_rope.settings import check
 from sbi_rope.stacking import LearningCurve, StackingReport
 from sbi_rope.stacking.sections import is_corrected
+from sbi_rope.utils.settings import check
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-__all__ = ["stacking_report"]
 
 # The most candidates that are drawn.
 MAX_CANDIDATES = 12

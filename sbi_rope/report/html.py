@@ -4,27 +4,25 @@ import base64
 import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from importlib import import_module
+from importlib import metadata
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sbi_rope.diagnosis import Diagnosis
-from sbi_rope.errors import InvalidInputError
 from sbi_rope.plots import (
     discrepancy,
     implied_parameters,
     ranks_by_estimate,
     stacking_report,
 )
-from sbi_rope.settings import check, names_of
 from sbi_rope.stacking import StackingReport
 from sbi_rope.stacking.sections import METHODS, headline, sections_of
+from sbi_rope.utils.errors import InvalidInputError
+from sbi_rope.utils.settings import check, names_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-__all__ = ["write_html"]
 
 # A page of this package is recognised by this.
 GENERATOR = '<meta name="generator" content="sbi_rope'
@@ -50,7 +48,25 @@ def write_html(
     parameter_names: Sequence[str] | None = None,
     x_names: Sequence[str] | None = None,
 ) -> None:
-    """Write the report of a stack as one HTML file, see ``StackingReport.to_html``."""
+    """Write the report of a stack as one HTML file that can be sent to somebody.
+
+    It says what printing says, with tables and pictures, and what the words mean. It
+    needs no other file, no script and no network.
+
+    Args:
+        report: The ``report`` of the posterior that :func:`sbi_rope.stack` returned.
+        path: The file. Its folder is made if there is none. A report of this package
+            that is there already is replaced, and no other file.
+        diagnosis: What :func:`sbi_rope.diagnose` says about a batch, if the report
+            should hold it.
+        parameter_names: A name for each parameter. If None, those that ``RoPE`` was
+            given, or "theta_1" and so on.
+        x_names: A name for each entry of x; "x[0]" and so on if None.
+
+    Raises:
+        InvalidInputError: If the names do not fit, or the path is a folder or a file of
+            something else.
+    """
     check("report", report, StackingReport)
     check("diagnosis", diagnosis, Diagnosis | None)
     path = Path(path).expanduser()
@@ -83,7 +99,7 @@ def write_html(
     )
     text = environment.get_template("page.html.j2").render(
         title="Repaired posterior: report",
-        version=import_module("sbi_rope").__version__,
+        version=metadata.version("sbi-rope"),
         headline=headline(report),
         sections=parts,
     )

@@ -12,8 +12,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from sbi_rope._sbi import MixedDensity, NeuralPosterior, embed, has_parameters
-from sbi_rope._standardisation import Standardisation
+from sbi_rope.data.pairs import without_warning_of_few_pairs
 from sbi_rope.density import Density, Flow, GaussianProcess, Given, Prior, density_of
 from sbi_rope.discrepancy.correction import (
     Correction,
@@ -26,26 +25,19 @@ from sbi_rope.discrepancy.correction import (
     network_of,
 )
 from sbi_rope.discrepancy.unlabelled import Marginal, fit_unlabelled
-from sbi_rope.ensemble import Ensemble
-from sbi_rope.errors import InvalidInputError, UnsupportedPosteriorError, warn_user
-from sbi_rope.finetuning import FINETUNING, TUNING, finetune_flow
-from sbi_rope.fit import without_warning_of_few_pairs
-from sbi_rope.rope import RoPE
-from sbi_rope.settings import check
+from sbi_rope.npe.sbi import MixedDensity, NeuralPosterior, embed, has_parameters
+from sbi_rope.npe.standardisation import Standardisation
+from sbi_rope.rope.finetuning import FINETUNING, TUNING, finetune_flow
+from sbi_rope.rope.rope import RoPE
 from sbi_rope.stacking.data import NUM_FOLDS, StackData, key_of
-from sbi_rope.tensors import as_batch, as_numbers
-
-__all__ = [
-    "Candidate",
-    "DiscrepancyCandidate",
-    "FinetunedCandidate",
-    "GivenCandidate",
-    "RegressionCandidate",
-    "UnlabelledCandidate",
-    "chosen_candidates",
-    "default_candidates",
-    "left_out",
-]
+from sbi_rope.training.ensemble import Ensemble
+from sbi_rope.utils.errors import (
+    InvalidInputError,
+    UnsupportedPosteriorError,
+    warn_user,
+)
+from sbi_rope.utils.settings import check
+from sbi_rope.utils.tensors import as_batch, as_numbers
 
 
 class Candidate(ABC):

@@ -8,21 +8,19 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._prior import PriorDistribution
-from sbi_rope._random import seeded
-from sbi_rope._sbi import embed, estimator_of, has_parameters
-from sbi_rope._standardisation import Standardisation
-from sbi_rope.data import Nodes
+from sbi_rope.data.labels import nodes_of, reference_of
+from sbi_rope.data.pairs import Nodes
+from sbi_rope.data.simulate import Moments, moments
 from sbi_rope.density.base import Density
 from sbi_rope.discrepancy.correction import Space, tuning_targets
 from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.report import DiscrepancyReport, report_discrepancy
-from sbi_rope.errors import NotReadyError
-from sbi_rope.labels import nodes_of, reference_of
-from sbi_rope.rope import RoPE
-from sbi_rope.simulate import Moments, moments
-
-__all__ = ["StackData", "draw_seeds"]
+from sbi_rope.npe.prior import PriorDistribution
+from sbi_rope.npe.sbi import embed, estimator_of, has_parameters
+from sbi_rope.npe.standardisation import Standardisation
+from sbi_rope.rope.rope import RoPE
+from sbi_rope.utils.errors import NotReadyError
+from sbi_rope.utils.seeds import seeded
 
 # Simulations from the prior that the corrected candidates are trained on, and
 # simulations at the parameters of each pair.

@@ -8,12 +8,10 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_rope.density import Density, Flow, Mixture, MixturePosterior
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.sets import SetScores
+from sbi_rope.density.sets import SetScores
 from sbi_rope.stacking.report import StackingReport
-from sbi_rope.tensors import as_batch, check_same_length
-
-__all__ = ["StackedPosterior", "Versions", "fold_posterior", "mixture_of"]
+from sbi_rope.utils.errors import InvalidInputError
+from sbi_rope.utils.tensors import as_batch, check_same_length
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,28 +1,24 @@
 """The report of a stack: what out-of-fold scores say about it."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from os import PathLike
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from sbi_rope._statistics import Estimate, TwoSampleTest
+from sbi_rope.density.sets import SetScores
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.metrics import Evaluation
-from sbi_rope.sets import SetScores
-from sbi_rope.settings import Count, check, one_of
+from sbi_rope.metrics.statistics import Estimate, TwoSampleTest
 from sbi_rope.stacking.sections import sections_of, text_of
 from sbi_rope.stacking.weights import (
     StackingWeights,
     fold_weights,
     stacking_weights,
 )
-
-__all__ = ["LearningCurve", "StackingReport"]
+from sbi_rope.utils.settings import Count, check, one_of
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -242,43 +238,6 @@ class StackingReport:
                 row[f"{key}_high"] = found.high
             rows.append(row)
         return sorted(rows, key=lambda row: -row["score"])
-
-    def to_html(
-        self,
-        path: str | PathLike[str],
-        *,
-        diagnosis: Any = None,
-        parameter_names: Sequence[str] | None = None,
-        x_names: Sequence[str] | None = None,
-    ) -> None:
-        """Write the report as one HTML file that can be sent to somebody.
-
-        It says what printing says, with tables and pictures, and what the words mean.
-        It needs no other file, no script and no network.
-
-        Args:
-            path: The file. Its folder is made if there is none. A report of this
-                package that is there already is replaced, and no other file.
-            diagnosis: What :func:`sbi_rope.diagnose` says about a batch, if the report
-                should hold it.
-            parameter_names: A name for each parameter. If None, those that ``RoPE`` was
-                given, or "theta_1" and so on.
-            x_names: A name for each entry of x; "x[0]" and so on if None.
-
-        Raises:
-            InvalidInputError: If the names do not fit, or the path is a folder or a
-                file of something else.
-        """
-        # This room draws with `plots`, which draws this report: it is above both.
-        from sbi_rope.report import write_html
-
-        write_html(
-            self,
-            path,
-            diagnosis=diagnosis,
-            parameter_names=parameter_names,
-            x_names=x_names,
-        )
 
     def __str__(self) -> str:
         return text_of(self, sections_of(self))

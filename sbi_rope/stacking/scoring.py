@@ -8,23 +8,21 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from sbi_rope._random import seeded
-from sbi_rope.data import Labels, Nodes, groups_of, one_of_each_group
+from sbi_rope.data.labels import nodes_of, reference_of
+from sbi_rope.data.pairs import Labels, Nodes, groups_of, one_of_each_group
 from sbi_rope.density import Density, Mixture, MixturePosterior
 from sbi_rope.density.base import without_nan
-from sbi_rope.errors import SamplingError, warn_user
-from sbi_rope.labels import nodes_of, reference_of
+from sbi_rope.density.sets import SetScores, joint_scores, marginal_scores
 from sbi_rope.metrics import Evaluation, draw_samples
 from sbi_rope.metrics.calls import draw_chunks
 from sbi_rope.metrics.evaluation import estimates_and_ranks
-from sbi_rope.sets import SetScores, joint_scores, marginal_scores
 from sbi_rope.stacking.candidates import Candidate
 from sbi_rope.stacking.data import StackData
 from sbi_rope.stacking.posterior import fold_posterior
 from sbi_rope.stacking.report import StackingReport
 from sbi_rope.stacking.weights import fold_weights
-
-__all__ = ["score_folds"]
+from sbi_rope.utils.errors import SamplingError, warn_user
+from sbi_rope.utils.seeds import seeded
 
 # Samples at each held-out pair, from which the calibration of the stack is computed,
 # and for how many observations at a time they are drawn.

@@ -5,15 +5,13 @@ import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
-from sbi_rope._statistics import Estimate
-from sbi_rope.discrepancy.parameters import is_improbable
+from sbi_rope.data.parameters import is_improbable
+from sbi_rope.density.sets import rank_needed
 from sbi_rope.metrics.evaluation import FEWEST, LEVEL, verdict_of
-from sbi_rope.sets import rank_needed
+from sbi_rope.metrics.statistics import Estimate
 
 if TYPE_CHECKING:
     from sbi_rope.stacking.report import StackingReport
-
-__all__ = ["METHODS", "Section", "is_corrected", "sections_of", "text_of"]
 
 # A stack is called mostly one method if this has half of the weight.
 MOSTLY = 0.5

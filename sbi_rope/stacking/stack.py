@@ -10,23 +10,21 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-from sbi_rope._progress import is_shown
-from sbi_rope._random import seeded
-from sbi_rope._sbi import check_density, embed, headless
-from sbi_rope._standardisation import warn_of_far_entries
-from sbi_rope._statistics import TwoSampleTest, compare_with_pairs
+from sbi_rope.data.parameters import probability_of_prior
 from sbi_rope.density import Density
-from sbi_rope.discrepancy.parameters import probability_of_prior
-from sbi_rope.errors import warn_user
-from sbi_rope.rope import RoPE
-from sbi_rope.settings import Range, check, default_names
+from sbi_rope.metrics.statistics import TwoSampleTest, compare_with_pairs
+from sbi_rope.npe.sbi import check_density, embed, headless
+from sbi_rope.npe.standardisation import warn_of_far_entries
+from sbi_rope.rope.rope import RoPE
 from sbi_rope.stacking.candidates import as_densities, chosen_candidates, left_out
 from sbi_rope.stacking.data import NUM_FOLDS, StackData, draw_seeds
 from sbi_rope.stacking.posterior import StackedPosterior, Versions
 from sbi_rope.stacking.report import LearningCurve, StackingReport
 from sbi_rope.stacking.scoring import score_folds
-
-__all__ = ["stack"]
+from sbi_rope.utils.errors import warn_user
+from sbi_rope.utils.progress import is_shown
+from sbi_rope.utils.seeds import seeded
+from sbi_rope.utils.settings import Range, check, default_names
 
 # The learning curve trains on these shares of the folds, and on all folds but one.
 SMALLER = (0.25, 0.5)

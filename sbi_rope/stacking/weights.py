@@ -6,11 +6,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sbi_rope.errors import InvalidInputError, warn_user
-from sbi_rope.settings import Count, NotNegative, Positive, check
-from sbi_rope.tensors import as_batch, as_numbers
-
-__all__ = ["StackingWeights", "fold_weights", "stacking_weights"]
+from sbi_rope.utils.errors import InvalidInputError, warn_user
+from sbi_rope.utils.settings import Count, NotNegative, Positive, check
+from sbi_rope.utils.tensors import as_batch, as_numbers
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -10,7 +10,6 @@ https://arxiv.org/abs/2405.08719). What is not as printed there is listed in
 from pathlib import Path
 from typing import Any
 
-from sbi_rope.settings import check, one_of
 from sbi_rope.tasks.base import Task
 from sbi_rope.tasks.cs import CancerStroma
 from sbi_rope.tasks.hemodynamics.task import Hemodynamics
@@ -22,6 +21,7 @@ from sbi_rope.tasks.ocean_colour import OceanColour
 from sbi_rope.tasks.pendulum import Pendulum
 from sbi_rope.tasks.sir import SIR
 from sbi_rope.tasks.wind_tunnel import WindTunnel
+from sbi_rope.utils.settings import check, one_of
 
 __all__ = ["TASKS", "Task", "get_task", "list_tasks"]
 

@@ -9,8 +9,6 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.settings import Count, Range, UnitInterval, check, one_of
 from sbi_rope.tasks.chambers import where
 from sbi_rope.tasks.settings import PaperSettings
 from sbi_rope.tasks.splits import MAX_SEED, DrawnPairs, Keep, Part, RecordedPairs
@@ -20,8 +18,8 @@ from sbi_rope.tasks.variants import (
     inside_region,
     with_label_noise,
 )
-
-__all__ = ["Task"]
+from sbi_rope.utils.errors import InvalidInputError
+from sbi_rope.utils.settings import Count, Range, UnitInterval, check, one_of
 
 Simulator = Callable[[Tensor], Tensor]
 

@@ -18,17 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_rope.errors import DataNotFoundError, InvalidInputError
-from sbi_rope.tensors import as_batch
-
-__all__ = [
-    "find_file",
-    "numbers_of",
-    "read_columns",
-    "read_images",
-    "read_table",
-    "where",
-]
+from sbi_rope.utils.errors import DataNotFoundError, InvalidInputError
+from sbi_rope.utils.tensors import as_batch
 
 DATASETS_PAGE = "https://github.com/juangamella/causal-chamber/tree/main/datasets"
 

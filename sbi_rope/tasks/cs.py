@@ -8,15 +8,13 @@ import torch
 from sbi.utils import BoxUniform
 from torch import Tensor, nn
 
-from sbi_rope.settings import Settings, UnitInterval
 from sbi_rope.tasks.base import Task
 from sbi_rope.tasks.distributions import box
 from sbi_rope.tasks.networks import fully_connected
 from sbi_rope.tasks.settings import STATISTICS_SETTINGS
 from sbi_rope.tasks.splits import DrawnPairs, Part
-from sbi_rope.tensors import as_batch
-
-__all__ = ["CancerStroma", "CancerStromaSimulator"]
+from sbi_rope.utils.settings import Settings, UnitInterval
+from sbi_rope.utils.tensors import as_batch
 
 STATISTICS = ("n_stromal", "n_cancer", "mean_distance", "max_distance")
 NUM_DISTANCES = 50  # the first stromal cells enter the two distances, others do not

@@ -10,8 +10,6 @@ from torch.distributions import Distribution, biject_to, constraints
 from torch.distributions.transforms import IndependentTransform, Transform
 from torch.nn.functional import logsigmoid
 
-__all__ = ["Arcsine", "UniformDistance", "UniformTriangle", "box"]
-
 # Nearest relative distance to its ends at which an arcsine density is evaluated.
 ARCSINE_EDGE = 2.0**-23
 

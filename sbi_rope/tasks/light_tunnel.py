@@ -7,7 +7,7 @@ import torch
 from sbi.utils import BoxUniform, MultipleIndependent
 from torch import Tensor
 
-from sbi_rope.settings import check, one_of
+from sbi_rope.npe.prior import check_in_support
 from sbi_rope.tasks.base import Task
 from sbi_rope.tasks.chambers import (
     find_file,
@@ -28,9 +28,7 @@ from sbi_rope.tasks.networks import ImageEmbedding
 from sbi_rope.tasks.settings import PaperSettings
 from sbi_rope.tasks.splits import DrawnPairs, Keep, Part, RecordedPairs, generator_of
 from sbi_rope.tasks.variants import COMMON_VARIANTS
-from sbi_rope.tensors import check_in_support
-
-__all__ = ["LightTunnel"]
+from sbi_rope.utils.settings import check, one_of
 
 DATASET = "lt_camera_v1"
 INPUTS = ("red", "green", "blue", "pol_1", "pol_2")

@@ -14,17 +14,8 @@ import torch
 from torch import Tensor
 from torch.distributions import Beta, Binomial
 
-from sbi_rope.settings import Count, Settings, UnitInterval
-from sbi_rope.tensors import as_batch
-
-__all__ = [
-    "CameraSimulator",
-    "HexagonSimulator",
-    "as_brightness",
-    "draw_crowded",
-    "hexagon_mask",
-    "malus",
-]
+from sbi_rope.utils.settings import Count, Settings, UnitInterval
+from sbi_rope.utils.tensors import as_batch
 
 MAX_LEVEL = 255  # of an 8-bit channel, and of a colour of the source
 RADIUS = 0.22  # of the light source, as a share of the image

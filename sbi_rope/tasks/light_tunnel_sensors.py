@@ -7,17 +7,16 @@ import torch
 from sbi.utils import BoxUniform, MultipleIndependent
 from torch import Tensor, nn
 
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.settings import NotNegative, Settings, check
+from sbi_rope.npe.prior import check_in_support
 from sbi_rope.tasks.base import Task
 from sbi_rope.tasks.chambers import find_file, read_columns
 from sbi_rope.tasks.distributions import UniformDistance, box
 from sbi_rope.tasks.networks import fully_connected
 from sbi_rope.tasks.splits import Part, RecordedPairs
 from sbi_rope.tasks.variants import COMMON_VARIANTS
-from sbi_rope.tensors import as_batch, check_in_support
-
-__all__ = ["LightTunnelSensors", "LightTunnelSimulator"]
+from sbi_rope.utils.errors import InvalidInputError
+from sbi_rope.utils.settings import NotNegative, Settings, check
+from sbi_rope.utils.tensors import as_batch
 
 DATASET = "lt_interventions_standard_v1"
 INPUTS = ("red", "green", "blue", "pol_1", "pol_2")

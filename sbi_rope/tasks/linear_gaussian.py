@@ -9,15 +9,13 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import MultivariateNormal, Normal, StudentT
 
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.settings import Number, Positive, Range, Settings, default_names
 from sbi_rope.tasks.base import Task
 from sbi_rope.tasks.networks import fully_connected
 from sbi_rope.tasks.splits import DrawnPairs, Part
 from sbi_rope.tasks.variants import COMMON_VARIANTS
-from sbi_rope.tensors import as_batch
-
-__all__ = ["LinearGaussian", "LinearGaussianSimulator"]
+from sbi_rope.utils.errors import InvalidInputError
+from sbi_rope.utils.settings import Number, Positive, Range, Settings, default_names
+from sbi_rope.utils.tensors import as_batch
 
 MAX_DIM = 25
 NOISE_STD = 0.5

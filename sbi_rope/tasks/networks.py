@@ -5,13 +5,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-__all__ = [
-    "ImageEmbedding",
-    "SeriesEmbedding",
-    "fully_connected",
-    "light_series_embedding",
-]
-
 CHANNELS = (1, 16, 64, 128, 128, 128, 128, 128)
 STRIDES = (1, 2, 1, 2, 1, 2, 1)
 POOLS = ((3, 1), (3, 1), (3, 1))

@@ -7,16 +7,14 @@ import torch
 from sbi.utils import BoxUniform
 from torch import Tensor, nn
 
-from sbi_rope.settings import NotNegative, Settings
 from sbi_rope.tasks.base import Task
 from sbi_rope.tasks.chambers import find_file, numbers_of, read_table
 from sbi_rope.tasks.distributions import box
 from sbi_rope.tasks.networks import fully_connected
 from sbi_rope.tasks.splits import Part, RecordedPairs
 from sbi_rope.tasks.variants import COMMON_VARIANTS
-from sbi_rope.tensors import as_batch
-
-__all__ = ["OceanColour", "OceanColourSimulator"]
+from sbi_rope.utils.settings import NotNegative, Settings
+from sbi_rope.utils.tensors import as_batch
 
 FILE = Path("ocean", "nomad.csv")
 SOURCE = "https://doi.org/10.1016/j.rse.2005.07.001"

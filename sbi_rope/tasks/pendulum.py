@@ -8,16 +8,14 @@ import torch
 from sbi.utils import BoxUniform
 from torch import Tensor, nn
 
-from sbi_rope.settings import NotNegative, Settings
 from sbi_rope.tasks.base import Task
 from sbi_rope.tasks.distributions import box
 from sbi_rope.tasks.networks import SeriesEmbedding, light_series_embedding
 from sbi_rope.tasks.settings import PaperSettings
 from sbi_rope.tasks.splits import DrawnPairs, Part
 from sbi_rope.tasks.variants import COMMON_VARIANTS
-from sbi_rope.tensors import as_batch
-
-__all__ = ["Pendulum", "PendulumSimulator"]
+from sbi_rope.utils.settings import NotNegative, Settings
+from sbi_rope.utils.tensors import as_batch
 
 NUM_STEPS = 200
 DURATION = 10.0  # s

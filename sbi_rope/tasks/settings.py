@@ -2,8 +2,6 @@
 
 from dataclasses import dataclass
 
-__all__ = ["STATISTICS_SETTINGS", "PaperSettings"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class PaperSettings:

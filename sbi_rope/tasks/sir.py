@@ -8,15 +8,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from sbi_rope.settings import Count, NotNegative, Settings, UnitInterval
 from sbi_rope.tasks.base import Task
 from sbi_rope.tasks.distributions import UniformTriangle
 from sbi_rope.tasks.networks import fully_connected
 from sbi_rope.tasks.settings import STATISTICS_SETTINGS
 from sbi_rope.tasks.splits import DrawnPairs, Part
-from sbi_rope.tensors import as_batch
-
-__all__ = ["SIR", "SIRSimulator", "delay_weekend_reports", "summarise"]
+from sbi_rope.utils.settings import Count, NotNegative, Settings, UnitInterval
+from sbi_rope.utils.tensors import as_batch
 
 STATISTICS = (
     "log_mean",

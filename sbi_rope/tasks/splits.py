@@ -13,17 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from sbi_rope.errors import InvalidInputError, SimulationError, warn_user
-
-__all__ = [
-    "MAX_SEED",
-    "DrawnPairs",
-    "Keep",
-    "Part",
-    "RecordedPairs",
-    "generator_of",
-    "stream_of",
-]
+from sbi_rope.utils.errors import InvalidInputError, SimulationError, warn_user
 
 Part = Literal["calibration", "test", "simulation"]
 # The chance, in [0, 1], of parameters (n, d) to stay in a set; one number a row.

@@ -11,13 +11,6 @@ from torch.distributions import Distribution
 
 from sbi_rope.tasks.splits import stream_of
 
-__all__ = [
-    "COMMON_VARIANTS",
-    "beta_shaped",
-    "inside_region",
-    "with_label_noise",
-]
-
 COMMON_VARIANTS = {
     "prior_shift": "all real parameters come from a part of the prior's support, "
     "`shifted_region`",

@@ -7,6 +7,7 @@ import torch
 from sbi.utils import BoxUniform
 from torch import Tensor, nn
 
+from sbi_rope.npe.prior import check_in_support
 from sbi_rope.tasks.base import Task
 from sbi_rope.tasks.chambers import find_file, read_columns
 from sbi_rope.tasks.distributions import box
@@ -21,9 +22,7 @@ from sbi_rope.tasks.wind_tunnel_model import (
     NUM_STEPS,
     WindTunnelSimulator,
 )
-from sbi_rope.tensors import as_batch, check_in_support
-
-__all__ = ["WindTunnel"]
+from sbi_rope.utils.tensors import as_batch
 
 DATASET = "wt_intake_impulse_v1"
 EXPERIMENT = "load_out_0.5_osr_downwind_4"

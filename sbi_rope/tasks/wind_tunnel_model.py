@@ -9,7 +9,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from sbi_rope.settings import (
+from sbi_rope.utils.settings import (
     NotNegative,
     Number,
     Positive,
@@ -17,14 +17,7 @@ from sbi_rope.settings import (
     Settings,
     UnitInterval,
 )
-from sbi_rope.tensors import as_batch
-
-__all__ = [
-    "NUM_STEPS",
-    "SAMPLE_TIMES",
-    "WindTunnelSimulator",
-    "pressure_ratio",
-]
+from sbi_rope.utils.tensors import as_batch
 
 NUM_STEPS = 50
 FIRST_LOADED, LAST_LOADED = 5, 24  # samples taken at full load of the intake fan

@@ -16,12 +16,17 @@ from torch import Size, Tensor, nn
 
 import sbi_rope.baselines
 from sbi_rope import load, save
-from sbi_rope._random import seeded
 from sbi_rope.baselines import CalibrationMLP, Method, PlainNPE, Regression
 from sbi_rope.density import MixturePosterior
-from sbi_rope.discrepancy import DiscrepancyNPE
-from sbi_rope.errors import InvalidInputError, NotReadyError, RoPEError, RoPEWarning
-from sbi_rope.trainers.base import Kind
+from sbi_rope.methods import DiscrepancyNPE
+from sbi_rope.methods.base import Kind
+from sbi_rope.utils.errors import (
+    InvalidInputError,
+    NotReadyError,
+    RoPEError,
+    RoPEWarning,
+)
+from sbi_rope.utils.seeds import seeded
 from tests import baselines, problems
 from tests.baselines import (
     METHODS,

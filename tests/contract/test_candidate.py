@@ -10,11 +10,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from sbi_rope._random import seeded
-from sbi_rope._sbi import embed
-from sbi_rope.data import Nodes, Pairs
+from sbi_rope.data.pairs import Nodes, Pairs
 from sbi_rope.density import Density, Flow
-from sbi_rope.finetuning import CalibrationFinetuner, finetune_flow
+from sbi_rope.npe.sbi import embed
+from sbi_rope.rope.finetuning import CalibrationFinetuner, finetune_flow
 from sbi_rope.stacking import (
     Candidate,
     FinetunedCandidate,
@@ -23,12 +22,13 @@ from sbi_rope.stacking import (
     candidates,
 )
 from sbi_rope.stacking.candidates import corrected, tuned
+from sbi_rope.utils.seeds import seeded
 from tests import problems
 from tests.stacks import BOX, CANDIDATES, data_of, observed, problem, quick, rope_of
 
 # Batches and calibration sets are small here on purpose.
 pytestmark = [
-    pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning"),
+    pytest.mark.filterwarnings("ignore::sbi_rope.utils.errors.RoPEWarning"),
     pytest.mark.filterwarnings("ignore:Maximum number of epochs"),
 ]
 
@@ -246,7 +246,7 @@ def test_pairs_and_simulations_count_half_each_with_rehearsal_and_pairs_by_weigh
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The first loss of two flows that share their start, against its formula."""
-    from sbi_rope import finetuning
+    from sbi_rope.rope import finetuning
 
     estimator = problems.npe_posterior("mdn", "linear").posterior_estimator
     (theta, x), weights = problem(12, seed=1), torch.linspace(0.2, 3.0, 12)

@@ -13,7 +13,6 @@ from torch import Size, Tensor, nn
 from torch.distributions import Independent, Normal
 
 from sbi_rope import MixturePosterior, load
-from sbi_rope._sbi import embedding_of, estimator_of, headless
 from sbi_rope.density import (
     Coupled,
     Density,
@@ -26,7 +25,9 @@ from sbi_rope.density import (
 from sbi_rope.density import (
     posterior as posterior_module,
 )
-from sbi_rope.errors import (
+from sbi_rope.npe.sbi import embedding_of, estimator_of, headless
+from sbi_rope.saving import save
+from sbi_rope.utils.errors import (
     InvalidInputError,
     RoPEWarning,
     SamplingError,
@@ -186,7 +187,7 @@ def test_copies_and_files_answer_the_same(
     expected = posterior.log_prob_batched(theta, x)
     torch.manual_seed(1)
     draws = posterior.sample_batched((6,), x, **QUIET)
-    posterior.save(tmp_path / "posterior.pt")
+    save(posterior, tmp_path / "posterior.pt")
     trusted = (problems.Gaussians, problems.TableCoupling)
     there = copy.deepcopy(posterior)
     there.to("cpu")

@@ -18,7 +18,8 @@ from torch import Tensor, nn
 from torch.distributions import Bernoulli, Categorical, Distribution, Gamma
 
 from sbi_rope import CalibrationFinetuner, MixturePosterior, RoPE, SinkhornCoupler
-from sbi_rope._sbi import (
+from sbi_rope.density import Coupled
+from sbi_rope.npe.sbi import (
     VectorFieldDensity,
     embed,
     embedding_of,
@@ -27,9 +28,8 @@ from sbi_rope._sbi import (
     posterior_from,
     with_embedding,
 )
-from sbi_rope.density import Coupled
-from sbi_rope.errors import InvalidInputError, LogProbUnavailableError
-from sbi_rope.finetuning import trainable_copy
+from sbi_rope.rope.finetuning import trainable_copy
+from sbi_rope.utils.errors import InvalidInputError, LogProbUnavailableError
 from tests import problems
 
 IDENTITY = "identity"

@@ -8,7 +8,7 @@ import torch
 from sbi.utils import BoxUniform
 
 from sbi_rope.density import MixturePosterior, PriorPosterior
-from sbi_rope.errors import (
+from sbi_rope.utils.errors import (
     InvalidInputError,
     SamplingError,
 )

@@ -29,8 +29,8 @@ from torch.distributions import (
 )
 
 from sbi_rope import RoPE, load, save, stack
-from sbi_rope._prior import PriorDistribution
-from sbi_rope.errors import InvalidInputError
+from sbi_rope.npe.prior import PriorDistribution
+from sbi_rope.utils.errors import InvalidInputError
 from tests.stacks import DEFAULTS, QUIET, quick
 
 ONE, TWO = torch.ones(1), torch.ones(2)

@@ -8,10 +8,9 @@ import torch
 from torch import Tensor
 
 from sbi_rope import RoPE
-from sbi_rope.discrepancy import DiscrepancyNPE
+from sbi_rope.methods import DiscrepancyNPE, FinetunedNPE
+from sbi_rope.methods.training import Training
 from sbi_rope.metrics import draw_samples, evaluate
-from sbi_rope.trainers import FinetunedNPE
-from sbi_rope.trainers.training import Training
 from tests import gaussian, problems
 from tests.stacks import (
     NPE,

@@ -28,10 +28,11 @@ from sbi_rope import (
     save,
     stack,
 )
-from sbi_rope.discrepancy import DiscrepancyModel, DiscrepancyNPE
-from sbi_rope.errors import RoPEError
+from sbi_rope.discrepancy import DiscrepancyModel
+from sbi_rope.methods import DiscrepancyNPE
 from sbi_rope.stacking import default_candidates
 from sbi_rope.tasks import get_task
+from sbi_rope.utils.errors import RoPEError
 from tests import gaussian
 
 pytestmark = pytest.mark.filterwarnings("ignore")

@@ -14,9 +14,9 @@ from torch.distributions import Gamma, Independent
 
 from sbi_rope import RoPE
 from sbi_rope.baselines import FinetunedNPE
-from sbi_rope.errors import RoPEWarning
-from sbi_rope.finetuning import FINETUNING
+from sbi_rope.rope.finetuning import FINETUNING
 from sbi_rope.stacking import StackedPosterior, default_candidates, stack
+from sbi_rope.utils.errors import RoPEWarning
 
 PRIOR = Independent(Gamma(1.5 * torch.ones(2), torch.ones(2)), 1)
 

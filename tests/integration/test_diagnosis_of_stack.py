@@ -14,7 +14,7 @@ from tests import problems
 from tests.stacks import NPE, NUM_PAIRS, PRIOR, QUIET, Box, problem, rope_of, stacked
 
 # Batches and calibration sets are small here on purpose.
-pytestmark = pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::sbi_rope.utils.errors.RoPEWarning")
 
 SHIFTS = {"prior shift: theta_1", "prior shift: theta_2"}
 UNLIKE = "batch unlike the calibration pairs"

@@ -13,10 +13,10 @@ from scipy import stats
 from torch import Tensor
 from torch.distributions import Normal
 
-from sbi_rope._random import seeded
 from sbi_rope.baselines import PlainNPE, Training
 from sbi_rope.discrepancy import DiscrepancyDraws, DiscrepancyModel
-from sbi_rope.discrepancy.npe import DiscrepancyNPE
+from sbi_rope.methods.discrepancy_npe import DiscrepancyNPE
+from sbi_rope.utils.seeds import seeded
 from tests import gaussian
 
 pytestmark = [

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from sbi_rope import CalibrationFinetuner, MixturePosterior, RoPE, SinkhornCoupler
-from sbi_rope._sbi import headless
 from sbi_rope.density import Coupled
 from sbi_rope.metrics import evaluate
+from sbi_rope.npe.sbi import headless
 from tests import gaussian
 
 

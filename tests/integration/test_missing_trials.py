@@ -5,17 +5,16 @@ import torch
 from torch import Tensor
 
 from sbi_rope import RoPE, diagnose
-from sbi_rope.discrepancy import DiscrepancyNPE
-from sbi_rope.errors import (
-    InvalidInputError,
-    UnsupportedPosteriorError,
-)
+from sbi_rope.methods import DiscrepancyNPE, FinetunedNPE
+from sbi_rope.methods.training import Training
 from sbi_rope.metrics import draw_samples, evaluate
 from sbi_rope.stacking import (
     default_candidates,
 )
-from sbi_rope.trainers import FinetunedNPE
-from sbi_rope.trainers.training import Training
+from sbi_rope.utils.errors import (
+    InvalidInputError,
+    UnsupportedPosteriorError,
+)
 from tests import problems
 from tests.stacks import QUICK, QUIET, stacked
 

@@ -24,7 +24,7 @@ from sbi_rope import (
     RoPE,
     SinkhornCoupler,
 )
-from sbi_rope._sbi import embed
+from sbi_rope.npe.sbi import embed
 from tests import problems
 
 NUM_OBSERVATIONS = 60

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sbi_rope.sets import is_held, joint_scores, rank_needed
+from sbi_rope.density.sets import is_held, joint_scores, rank_needed
 from sbi_rope.stacking.weights import fold_weights
 
 pytestmark = pytest.mark.slow

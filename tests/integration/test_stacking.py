@@ -15,12 +15,8 @@ from torch import Tensor
 from sbi_rope import load
 from sbi_rope.baselines import PriorPosterior
 from sbi_rope.density import MixturePosterior, Prior
-from sbi_rope.errors import (
-    InvalidInputError,
-    NotReadyError,
-    SamplingError,
-    UnsupportedPosteriorError,
-)
+from sbi_rope.report import write_html
+from sbi_rope.saving import save
 from sbi_rope.stacking import (
     DiscrepancyCandidate,
     FinetunedCandidate,
@@ -29,6 +25,12 @@ from sbi_rope.stacking import (
     stacking_weights,
 )
 from sbi_rope.stacking.posterior import mixture_of
+from sbi_rope.utils.errors import (
+    InvalidInputError,
+    NotReadyError,
+    SamplingError,
+    UnsupportedPosteriorError,
+)
 from tests import problems
 from tests.stacks import (
     BOX,
@@ -51,7 +53,7 @@ from tests.stacks import (
 )
 
 # Batches and calibration sets are small here on purpose.
-pytestmark = pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::sbi_rope.utils.errors.RoPEWarning")
 
 
 # --- scores ---
@@ -201,7 +203,7 @@ def test_copies_pickles_and_files_have_the_same_densities(tmp_path: Path) -> Non
     posterior = the_stack()
     expected = posterior.log_prob_batched(theta, x)
     candidates = posterior.candidate_log_probs(theta, x)
-    posterior.save(tmp_path / "stack.pt")
+    save(posterior, tmp_path / "stack.pt")
     pickled = pickle.loads(pickle.dumps(posterior))
     for other in (pickled, copy.deepcopy(posterior), load(tmp_path / "stack.pt")):
         assert torch.equal(other.log_prob_batched(theta, x), expected)
@@ -216,10 +218,10 @@ def test_a_candidate_of_ten_lines_can_be_stacked_reported_and_kept(
     posterior = small_stack()
     assert list(posterior.candidate_weights) == ["prior", "NPE", "box"]
     assert "box" in str(posterior.report)
-    posterior.report.to_html(tmp_path / "report.html")
+    write_html(posterior.report, tmp_path / "report.html")
     assert "box" in (tmp_path / "report.html").read_text()
     theta, x = problem(9, seed=3)
-    posterior.save(tmp_path / "stack.pt")
+    save(posterior, tmp_path / "stack.pt")
     found = load(tmp_path / "stack.pt").log_prob_batched(theta, x)
     assert torch.equal(found, posterior.log_prob_batched(theta, x))
     curve = stacked(rope_of(), candidates=[BOX], learning_curve=True, num_folds=5)

@@ -8,9 +8,11 @@ import pytest
 import torch
 
 from sbi_rope import RoPE, load, stack
-from sbi_rope._prior import PriorDistribution
-from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics import evaluate
+from sbi_rope.npe.prior import PriorDistribution
+from sbi_rope.report import write_html
+from sbi_rope.saving import save
+from sbi_rope.utils.errors import InvalidInputError
 from tests import gaussian
 from tests.stacks import (
     CANDIDATES,
@@ -58,10 +60,10 @@ def test_a_stack_is_scored_on_what_was_measured(tmp_path: Any) -> None:
     assert math.isfinite(posterior.report.held_out.acauc.mean)
     with pytest.raises(InvalidInputError, match="some exact labels"):
         posterior.credible_set(0.8, x=observed()[:1], guaranteed=True)
-    posterior.save(tmp_path / "stack")
+    save(posterior, tmp_path / "stack")
     loaded = load(tmp_path / "stack")
     assert loaded.report.labels == scores.labels
-    loaded.report.to_html(tmp_path / "report.html")
+    write_html(loaded.report, tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert known in page
     assert ">nan<" not in page
@@ -82,7 +84,7 @@ def test_exact_labels_among_others_give_sets_with_a_guarantee(tmp_path: Path) ->
     assert len(scores) == 8
     assert torch.isfinite(scores.joint).all()
     x = observed()[:1]
-    posterior.save(tmp_path / "stack")
+    save(posterior, tmp_path / "stack")
     again = load(tmp_path / "stack").credible_intervals(0.8, x, guaranteed=True, seed=0)
     expected = posterior.credible_intervals(0.8, x, guaranteed=True, seed=0)
     assert torch.equal(again.low, expected.low)
@@ -116,7 +118,7 @@ def test_labels_given_as_draws_are_scored_relative_to_the_prior(tmp_path: Path) 
     text = " ".join(str(posterior.report).split())
     assert "Coverage is not known" in text
     assert "relative to that of the prior" in text
-    posterior.report.to_html(tmp_path / "draws.html")
+    write_html(posterior.report, tmp_path / "draws.html")
     page = (tmp_path / "draws.html").read_text()
     assert ">nan" not in page
     assert "Coverage is not known" in page
@@ -133,7 +135,7 @@ def test_a_parameter_that_was_never_measured_is_named(tmp_path: Path) -> None:
     report = stacked(labelled(theta), candidates=[PRIOR, NPE]).report
     assert torch.isfinite(report.held_out.coverage.nanmean(dim=1)).all()
     assert "theta_1 was not measured" in str(report)
-    report.to_html(tmp_path / "never.html", parameter_names=["mass", "length"])
+    write_html(report, tmp_path / "never.html", parameter_names=["mass", "length"])
     assert "mass was not measured" in (tmp_path / "never.html").read_text()
 
 

@@ -16,12 +16,14 @@ import torch
 from torch.distributions import Cauchy, Distribution, Independent, MultivariateNormal
 
 from sbi_rope import diagnose, load, plots, stack
-from sbi_rope._prior import PriorDistribution
-from sbi_rope._statistics import Estimate, TwoSampleTest
 from sbi_rope.discrepancy import DiscrepancyModel
-from sbi_rope.errors import InvalidInputError, RoPEWarning
 from sbi_rope.metrics import Evaluation
+from sbi_rope.metrics.statistics import Estimate, TwoSampleTest
+from sbi_rope.npe.prior import PriorDistribution
+from sbi_rope.report import write_html
+from sbi_rope.saving import save
 from sbi_rope.stacking import DiscrepancyCandidate, LearningCurve, StackingReport
+from sbi_rope.utils.errors import InvalidInputError, RoPEWarning
 from tests import problems
 from tests.stacks import (
     BOX,
@@ -40,7 +42,7 @@ from tests.stacks import (
 )
 
 # Batches and calibration sets are small here on purpose.
-pytestmark = pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::sbi_rope.utils.errors.RoPEWarning")
 
 DISCREPANCY = DiscrepancyCandidate(space="embedding")
 CANDIDATES = ("prior", "NPE", "discrepancy", "discrepancy (tuned)")
@@ -456,7 +458,7 @@ def test_names_of_parameters_are_given_once(tmp_path: Path) -> None:
     x = observed()
     for text in (written(posterior.report, tmp_path), str(posterior.report.held_out)):
         assert "theta_1" not in text
-    posterior.save(tmp_path / "stack.pt")
+    save(posterior, tmp_path / "stack.pt")
     assert load(tmp_path / "stack.pt").report.held_out.names == ("slope", "size")
     found = diagnose(named, x, num_simulations=100, num_folds=None, **QUIET)
     assert found.parameter_names == ("slope", "size")
@@ -500,7 +502,7 @@ class Page(HTMLParser):
 
 
 def written(report: StackingReport, folder: Path, **options: object) -> str:
-    report.to_html(folder / "report.html", **options)  # type: ignore[arg-type]
+    write_html(report, folder / "report.html", **options)  # type: ignore[arg-type]
     return (folder / "report.html").read_text(encoding="utf-8")
 
 
@@ -566,16 +568,16 @@ def test_an_own_report_is_replaced_and_nothing_else(
     other.write_text("<html>years of work</html>")
     for path in (other, tmp_path):
         with pytest.raises(InvalidInputError, match="an earlier report"):
-            report.to_html(path)
+            write_html(report, path)
     assert other.read_text() == "<html>years of work</html>"
 
 
 def test_names_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     report, path = the_stack().report, tmp_path / "report.html"
     with pytest.raises(InvalidInputError, match="`parameter_names` to be 2"):
-        report.to_html(path, parameter_names=("a",))
+        write_html(report, path, parameter_names=("a",))
     with pytest.raises(InvalidInputError, match="Expected `x_names`"):
-        report.to_html(path, x_names=("a", "b"))
+        write_html(report, path, x_names=("a", "b"))
     with pytest.raises(InvalidInputError, match="Expected no `x_names`"):
-        replace(report, discrepancy=None).to_html(path, x_names=("a", "b", "c"))
+        write_html(replace(report, discrepancy=None), path, x_names=("a", "b", "c"))
     assert not path.exists()

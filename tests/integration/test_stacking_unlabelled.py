@@ -8,15 +8,15 @@ from torch import Tensor
 from torch.distributions import Independent, Normal
 
 from sbi_rope import RoPE, stack
+from sbi_rope.data.simulate import Moments
 from sbi_rope.discrepancy.unlabelled import Marginal, fit_unlabelled
-from sbi_rope.errors import InvalidInputError, RoPEWarning
-from sbi_rope.simulate import Moments
 from sbi_rope.stacking import UnlabelledCandidate, default_candidates
+from sbi_rope.utils.errors import InvalidInputError, RoPEWarning
 from tests import gaussian
 from tests.stacks import BOX, NPE, PRIOR, observed, rope_of, stacked
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore::sbi_rope.errors.RoPEWarning", "ignore:Maximum number of epochs"
+    "ignore::sbi_rope.utils.errors.RoPEWarning", "ignore:Maximum number of epochs"
 )
 GAIN = torch.tensor([[0.8, 0.1], [0.0, 1.1]]).double()
 OFFSET, ERROR_STD, NOISE_STD = torch.tensor([0.3, -0.2]).double(), 0.2, 0.1

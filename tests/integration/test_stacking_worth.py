@@ -16,7 +16,7 @@ from tests.stacks import QUIET
 # Batches and calibration sets are small here on purpose.
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning"),
+    pytest.mark.filterwarnings("ignore::sbi_rope.utils.errors.RoPEWarning"),
 ]
 
 

@@ -10,9 +10,9 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_rope import MixturePosterior, RoPE
-from sbi_rope._sbi import estimator_of
 from sbi_rope.density import Flow, average
-from sbi_rope.errors import (
+from sbi_rope.npe.sbi import estimator_of
+from sbi_rope.utils.errors import (
     InvalidInputError,
     UnsupportedPosteriorError,
 )

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.distributions import Cauchy, MultivariateNormal, Normal
 
-from sbi_rope._random import seeded
 from sbi_rope.baselines.error_model import SpikeAndSlab, denoise, split_r_hat
+from sbi_rope.utils.seeds import seeded
 
 MODEL = SpikeAndSlab()
 

@@ -10,14 +10,14 @@ import torch
 from sbi.neural_nets import posterior_nn
 from torch import Tensor, nn
 
-from sbi_rope._random import seeded
 from sbi_rope.baselines import FinetunedNPE, PlainNPE, Training
-from sbi_rope.data import split_groups, split_pairs
+from sbi_rope.data.pairs import epochs_on_pairs, split_groups, split_pairs
 from sbi_rope.density import MixturePosterior
-from sbi_rope.discrepancy import DiscrepancyNPE
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.fit import epochs_on_pairs, fit, shuffled
+from sbi_rope.methods import DiscrepancyNPE
 from sbi_rope.tasks import get_task
+from sbi_rope.training.fit import fit, shuffled
+from sbi_rope.utils.errors import InvalidInputError
+from sbi_rope.utils.seeds import seeded
 
 pytestmark = pytest.mark.filterwarnings("ignore:Maximum number of epochs")
 

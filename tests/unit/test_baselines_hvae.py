@@ -12,7 +12,6 @@ from sbi.utils import BoxUniform
 from torch import Tensor, nn
 from torch.distributions import Independent, MultivariateNormal, Normal
 
-from sbi_rope._sbi import headless
 from sbi_rope.baselines.hvae import HVAE, OverLatents
 from sbi_rope.baselines.hvae_model import (
     ConditionalUNet,
@@ -20,8 +19,9 @@ from sbi_rope.baselines.hvae_model import (
     HybridVAE,
     reparametrised_sample,
 )
+from sbi_rope.methods import Training
+from sbi_rope.npe.sbi import headless
 from sbi_rope.tasks.pendulum import PendulumSimulator
-from sbi_rope.trainers import Training
 from tests.baselines import swing
 
 # --- a linear-Gaussian model whose evidence is known ---

@@ -11,10 +11,10 @@ from sbi.neural_nets import posterior_nn
 from torch import Tensor
 from torch.distributions import Independent, Normal
 
-from sbi_rope._sbi import embedding_of, estimator_of
 from sbi_rope.baselines import NNPE, PlainNPE, SpikeAndSlab, Training
 from sbi_rope.baselines.statistics import SoftClip
 from sbi_rope.metrics import evaluate
+from sbi_rope.npe.sbi import embedding_of, estimator_of
 from tests import problems
 
 QUIET: dict[str, Any] = {"seed": 0, "show_progress_bars": False}

@@ -8,10 +8,10 @@ import torch
 from sbi.neural_nets import posterior_nn
 from torch import Tensor, nn
 
-from sbi_rope._sbi import embed, embedding_of
 from sbi_rope.baselines import NPERS, PlainNPE, Training
 from sbi_rope.baselines.npe_rs import squared_mmd
-from sbi_rope.errors import RoPEWarning
+from sbi_rope.npe.sbi import embed, embedding_of
+from sbi_rope.utils.errors import RoPEWarning
 from tests.problems import standard_normal
 
 pytestmark = pytest.mark.filterwarnings("ignore:Maximum number of epochs")

@@ -10,8 +10,8 @@ from torch.distributions import Normal
 
 from sbi_rope.baselines import RNPE, SpikeAndSlab, Training
 from sbi_rope.baselines.rnpe import fit_marginal
-from sbi_rope.errors import RoPEWarning
 from sbi_rope.metrics import evaluate
+from sbi_rope.utils.errors import RoPEWarning
 from tests import gaussian
 
 # theta ~ N(0, 1), x = theta + 0.5 eps, q(theta | s) = N(s, 0.2) with s = 0.8 x.

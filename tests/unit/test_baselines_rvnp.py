@@ -8,9 +8,9 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Independent, MultivariateNormal, Normal
 
-from sbi_rope._sbi import estimator_of, gaussians_of
 from sbi_rope.baselines import RVNP, Training
 from sbi_rope.baselines.rvnp import Bound, ErrorModel, fit_surrogate, log_likelihood
+from sbi_rope.npe.sbi import estimator_of, gaussians_of
 from tests import gaussian
 
 QUIET: dict[str, Any] = {"seed": 0, "show_progress_bars": False}

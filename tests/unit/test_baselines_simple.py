@@ -81,7 +81,7 @@ class TestWithPlentyOfPairs:
         exact = TASK.get_true_posterior(x).log_prob(theta.double()).mean()
         return float(exact - log_probs(method.build_posterior(), theta, x).mean())
 
-    @pytest.mark.filterwarnings("error::sbi_rope.errors.RoPEWarning")
+    @pytest.mark.filterwarnings("error::sbi_rope.utils.errors.RoPEWarning")
     def test_npe_stays_wrong_but_is_right_where_its_simulator_is(self) -> None:
         assert self.loss_of(npe()) > 2
         theta, simulator = TASK.get_test_set(1000)[0], TASK.get_simulator()

@@ -14,9 +14,9 @@ from benchmarks.cases import cached, posterior_with, state_of
 from benchmarks.cells import Cell
 from benchmarks.presets import PRESETS
 from benchmarks.store import Result, Results
-from sbi_rope._files import write_atomically
-from sbi_rope._sbi import embedding_of
+from sbi_rope.npe.sbi import embedding_of
 from sbi_rope.tasks import get_task
+from sbi_rope.utils.files import write_atomically
 from tests.results import result_of
 
 CELLS = [

@@ -18,7 +18,7 @@ from sbi_rope.coupling.sinkhorn import (
     marginal_error,
     solve_fixed_point,
 )
-from sbi_rope.errors import CouplingError, RoPEWarning
+from sbi_rope.utils.errors import CouplingError, RoPEWarning
 from tests import oracles
 
 # The ways to solve a coupling that have to agree.

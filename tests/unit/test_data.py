@@ -6,17 +6,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from sbi_rope.data import (
+from sbi_rope.data.pairs import (
+    EPOCHS_WITHOUT_HOLDOUT,
     MIN_PAIRS_FOR_HOLDOUT,
     Labels,
     Pairs,
+    epochs_on_pairs,
     groups_of,
     one_of_each_group,
     split_groups,
     split_pairs,
 )
-from sbi_rope.errors import RoPEWarning
-from sbi_rope.fit import EPOCHS_WITHOUT_HOLDOUT, epochs_on_pairs
+from sbi_rope.utils.errors import RoPEWarning
 
 NAN = math.nan
 

@@ -11,7 +11,6 @@ from scipy.stats import kstest
 from torch import Tensor, nn
 
 from sbi_rope import CalibrationFinetuner, RoPE, SinkhornCoupler
-from sbi_rope._statistics import compare_with_pairs
 from sbi_rope.diagnosis import Diagnosis, diagnose
 from sbi_rope.diagnosis.misspecification import distances, mmd_test, unmatched
 from sbi_rope.diagnosis.prior_shift import prior_shift
@@ -23,6 +22,7 @@ from sbi_rope.diagnosis.residuals import (
     residual_finding,
 )
 from sbi_rope.diagnosis.simulations import Simulations
+from sbi_rope.metrics.statistics import compare_with_pairs
 from sbi_rope.plots import implied_parameters
 from tests import gaussian
 
@@ -252,7 +252,7 @@ def test_categories_of_a_right_simulator_have_simulations_near_them() -> None:
     ("n", "gamma", "remedy"),
     [(60, 0.003, "Raise"), (60, 9.0, "Lower gamma"), (1, 0.5, "use `stack(rope)`")],
 )
-@pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
+@pytest.mark.filterwarnings("ignore::sbi_rope.utils.errors.RoPEWarning")
 def test_posteriors_of_very_few_or_very_many_simulations_alarm(
     n: int, gamma: float, remedy: str
 ) -> None:
@@ -433,7 +433,7 @@ def test_averaging_does_not_alarm_and_a_lost_parameter_does() -> None:
     assert bias_finding((best - target).double(), theta.double(), known).alarming
 
 
-@pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
+@pytest.mark.filterwarnings("ignore::sbi_rope.utils.errors.RoPEWarning")
 def test_residuals_are_of_pairs_that_g_was_not_trained_on() -> None:
     torch.manual_seed(23)
     theta, x = gaussian.labelled(6)

@@ -3,10 +3,10 @@
 import torch
 from torch import Tensor
 
-from sbi_rope._standardisation import Standardisation
+from sbi_rope.data.simulate import Moments
 from sbi_rope.discrepancy import DiscrepancyModel
 from sbi_rope.discrepancy.correction import fit_discrepancy, surprise
-from sbi_rope.simulate import Moments
+from sbi_rope.npe.standardisation import Standardisation
 
 WIDTH = 9
 

@@ -10,18 +10,19 @@ from sbi.inference import DirectPosterior, VectorFieldPosterior
 from sbi.neural_nets import posterior_nn
 from torch import Tensor, nn
 
-from sbi_rope._sbi import embedding_of, estimator_of
-from sbi_rope._standardisation import Standardisation
 from sbi_rope.baselines import Training
+from sbi_rope.data.simulate import Moments
 from sbi_rope.density import Flow, MixturePosterior
-from sbi_rope.discrepancy import DiscrepancyModel, DiscrepancyNPE
+from sbi_rope.discrepancy import DiscrepancyModel
 from sbi_rope.discrepancy.correction import correct_flow, fit_discrepancy
-from sbi_rope.errors import (
+from sbi_rope.methods import DiscrepancyNPE
+from sbi_rope.npe.sbi import embedding_of, estimator_of
+from sbi_rope.npe.standardisation import Standardisation
+from sbi_rope.utils.errors import (
     InvalidInputError,
     NotReadyError,
     UnsupportedPosteriorError,
 )
-from sbi_rope.simulate import Moments
 from tests import problems
 
 pytestmark = [
@@ -75,7 +76,7 @@ def scratch(space: str) -> DiscrepancyNPE:
 
 
 @pytest.mark.medium
-@pytest.mark.filterwarnings("error::sbi_rope.errors.RoPEWarning")
+@pytest.mark.filterwarnings("error::sbi_rope.utils.errors.RoPEWarning")
 @pytest.mark.parametrize("space", SPACES)
 def test_every_source_of_simulations_gives_a_posterior_of_sbi(space: str) -> None:
     expected = MixturePosterior if space == "tuned" else DirectPosterior
@@ -249,7 +250,7 @@ def test_pairs_are_embedded_by_a_net_that_was_tuned_on_all_others() -> None:
         nets = [Remembering(x[rows]) for rows in sets]
         return SimpleNamespace(member=nets.__getitem__), []
 
-    with patch("sbi_rope.discrepancy.npe.TUNING", SimpleNamespace(tuned=tuned)):
+    with patch("sbi_rope.methods.discrepancy_npe.TUNING", SimpleNamespace(tuned=tuned)):
         _, z = made._cross_fitted(
             nn.Identity(), torch.ones(12, 1), simulations()[1], show_progress_bars=False
         )

@@ -10,8 +10,8 @@ from scipy import stats
 from torch import Tensor
 from torch.distributions import Gamma
 
+from sbi_rope.data.parameters import STRENGTHS, _fit, normal_scores
 from sbi_rope.discrepancy import ParameterDistribution, learn_parameters
-from sbi_rope.discrepancy.parameters import STRENGTHS, _fit, normal_scores
 
 CORRELATION = torch.tensor([[1.0, 0.6], [0.6, 1.0]]).double()
 

@@ -7,16 +7,12 @@ import torch
 from scipy import stats
 from torch import Tensor, nn
 
-from sbi_rope.discrepancy import (
-    DiscrepancyModel,
-    DiscrepancyNPE,
-    DiscrepancyReport,
-    Interval,
-)
+from sbi_rope.data.simulate import Moments
+from sbi_rope.discrepancy import DiscrepancyModel, DiscrepancyReport, Interval
 from sbi_rope.discrepancy.report import report_discrepancy
-from sbi_rope.errors import InvalidInputError, NotReadyError
-from sbi_rope.simulate import Moments
+from sbi_rope.methods import DiscrepancyNPE
 from sbi_rope.tasks import get_task
+from sbi_rope.utils.errors import InvalidInputError, NotReadyError
 from tests import problems
 
 # Mean, spread over the prior and noise of four simulated summaries, in their units.

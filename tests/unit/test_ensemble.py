@@ -14,11 +14,11 @@ from sbi.neural_nets.embedding_nets import (
 )
 from torch import Tensor, nn
 
-from sbi_rope._sbi import embedding_of, estimator_of, headless
 from sbi_rope.density import Flow
-from sbi_rope.ensemble import Ensemble, drawn, embedded, log_density
-from sbi_rope.fit import Training, fit
+from sbi_rope.npe.sbi import embedding_of, estimator_of, headless
 from sbi_rope.tasks.networks import SeriesEmbedding
+from sbi_rope.training.ensemble import Ensemble, drawn, embedded, log_density
+from sbi_rope.training.fit import Training, fit
 from tests import problems
 
 ALONE: Any = {"label": "", "show_progress_bars": False}

@@ -10,11 +10,11 @@ from sbi.utils.sbiutils import Standardize
 from torch import Tensor, nn
 
 from sbi_rope import CalibrationFinetuner, RoPE, diagnose, stack
-from sbi_rope._standardisation import deviations
 from sbi_rope.baselines import CalibrationMLP, FinetunedNPE, Training
 from sbi_rope.density import average
-from sbi_rope.discrepancy import DiscrepancyNPE
-from sbi_rope.errors import InvalidInputError, RoPEWarning
+from sbi_rope.methods import DiscrepancyNPE
+from sbi_rope.npe.standardisation import deviations
+from sbi_rope.utils.errors import InvalidInputError, RoPEWarning
 from tests import problems
 from tests.stacks import DEFAULTS, quick
 

@@ -5,13 +5,13 @@ import torch
 from torch import Tensor, nn
 
 from sbi_rope import CalibrationFinetuner
-from sbi_rope._random import seeded
-from sbi_rope.errors import RoPEWarning
-from sbi_rope.finetuning import (
+from sbi_rope.data.pairs import EPOCHS_WITHOUT_HOLDOUT
+from sbi_rope.rope.finetuning import (
     FinetuneResult,
     trainable_copy,
 )
-from sbi_rope.fit import EPOCHS_WITHOUT_HOLDOUT
+from sbi_rope.utils.errors import RoPEWarning
+from sbi_rope.utils.seeds import seeded
 from tests import gaussian
 
 

@@ -8,14 +8,14 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from sbi_rope.ensemble import Ensemble, embedded
-from sbi_rope.errors import RoPEWarning
-from sbi_rope.fit import (
+from sbi_rope.training.ensemble import Ensemble, embedded
+from sbi_rope.training.fit import (
     Courses,
     History,
     Training,
     fit,
 )
+from sbi_rope.utils.errors import RoPEWarning
 
 
 class Number(nn.Module):

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from sbi_rope.errors import InvalidInputError, SimulationError
 from sbi_rope.tasks.hemodynamics import generation
 from sbi_rope.tasks.hemodynamics.__main__ import main
 from sbi_rope.tasks.hemodynamics.dataset import BeatSet, load
 from sbi_rope.tasks.hemodynamics.generation import generate
 from sbi_rope.tasks.hemodynamics.population import NUISANCES, Population
 from sbi_rope.tasks.hemodynamics.subject import Beat, Physics, Subject
+from sbi_rope.utils.errors import InvalidInputError, SimulationError
 from tests.fresh import imported_anew
 
 N = 65

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sbi_rope.errors import SimulationError
 from sbi_rope.tasks.hemodynamics import waveforms
 from sbi_rope.tasks.hemodynamics.network import Network
 from sbi_rope.tasks.hemodynamics.solver import Flow, solve
+from sbi_rope.utils.errors import SimulationError
 from tests.blood_flow import BASELINE, REST, linear_pressure, make_network
 
 pytest.importorskip("numba")

@@ -15,15 +15,15 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal, Normal
 
 from sbi_rope import CalibrationFinetuner, RoPE
-from sbi_rope._prior import PriorDistribution
-from sbi_rope.data import Labels, Pairs
+from sbi_rope.data.labels import draws_of, nodes_of, reference_of
+from sbi_rope.data.pairs import Labels, Pairs
+from sbi_rope.data.simulate import moments
 from sbi_rope.discrepancy import DiscrepancyModel
 from sbi_rope.discrepancy.model import expected_means
-from sbi_rope.errors import InvalidInputError, RoPEWarning
-from sbi_rope.labels import draws_of, nodes_of, reference_of
-from sbi_rope.simulate import moments
+from sbi_rope.npe.prior import PriorDistribution
 from sbi_rope.stacking import stacking_weights
 from sbi_rope.stacking.scoring import _score_labels
+from sbi_rope.utils.errors import InvalidInputError, RoPEWarning
 from tests import gaussian
 
 NAN = math.nan

@@ -20,9 +20,9 @@ from torch.distributions import Gamma, Normal
 from torch.utils.tensorboard import SummaryWriter
 
 from sbi_rope import metrics
-from sbi_rope.errors import InvalidInputError, LogProbUnavailableError
 from sbi_rope.metrics import Estimate, Evaluation
 from sbi_rope.metrics.evaluation import NOMINAL, estimates_and_ranks, verdict_of
+from sbi_rope.utils.errors import InvalidInputError, LogProbUnavailableError
 from tests import gaussian
 from tests.refusals import assert_refused
 

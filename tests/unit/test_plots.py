@@ -9,9 +9,9 @@ from torch import Tensor
 
 from sbi_rope import SinkhornCoupler, plots
 from sbi_rope.discrepancy import DiscrepancyReport, Interval, SummaryDiscrepancy
-from sbi_rope.errors import RoPEWarning
-from sbi_rope.finetuning import History
 from sbi_rope.metrics import Evaluation
+from sbi_rope.rope.finetuning import History
+from sbi_rope.utils.errors import RoPEWarning
 from tests import stacks
 from tests.refusals import assert_refused
 

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from sbi_rope import CalibrationFinetuner, RoPE, stack
-from sbi_rope._progress import is_shown
+from sbi_rope.utils.progress import is_shown
 from tests import baselines, gaussian
 from tests.stacks import BOX, NPE, PRIOR, quick
 

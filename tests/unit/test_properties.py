@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from sbi_rope import SinkhornCoupler
-from sbi_rope.data import split_groups, split_pairs
+from sbi_rope.data.pairs import split_groups, split_pairs
 from sbi_rope.discrepancy import DiscrepancyModel, learn_parameters
-from sbi_rope.errors import RoPEError
 from sbi_rope.metrics.evaluation import estimates_and_ranks
 from sbi_rope.stacking import stacking_weights
+from sbi_rope.utils.errors import RoPEError
 
 # The same examples every time, and only as many as take a second or two.
 brief = settings(derandomize=True, max_examples=60, deadline=None, database=None)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sbi_rope._random import seeded
+from sbi_rope.utils.seeds import seeded
 
 
 def draws() -> list[float]:

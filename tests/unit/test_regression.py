@@ -11,8 +11,8 @@ from torch import Tensor
 
 from sbi_rope.baselines import Regression
 from sbi_rope.density import GaussianProcess
-from sbi_rope.errors import InvalidInputError
 from sbi_rope.metrics.evaluation import estimates_and_ranks
+from sbi_rope.utils.errors import InvalidInputError
 from tests import problems
 
 

@@ -14,14 +14,14 @@ from sbi_rope import (
     RoPE,
     SinkhornCoupler,
 )
-from sbi_rope.errors import (
+from sbi_rope.data.simulate import Stored
+from sbi_rope.utils.errors import (
     CouplingError,
     InvalidInputError,
     NotReadyError,
     RoPEWarning,
     UnsupportedPosteriorError,
 )
-from sbi_rope.simulate import Stored
 from tests import gaussian, problems
 
 QUICK = CalibrationFinetuner(max_num_epochs=20)

@@ -19,11 +19,11 @@ from torch import Tensor, nn
 
 from sbi_rope import MixturePosterior, StackedPosterior, load, save
 from sbi_rope.density import Flow, Mixture, PriorPosterior
-from sbi_rope.errors import DataNotFoundError, FileFormatError, InvalidInputError
 from sbi_rope.saving import ROOMS, _found
 from sbi_rope.stacking import DiscrepancyCandidate, FinetunedCandidate
 from sbi_rope.tasks.distributions import UniformTriangle
 from sbi_rope.tasks.hemodynamics.prior import PopulationPrior
+from sbi_rope.utils.errors import DataNotFoundError, FileFormatError, InvalidInputError
 from tests import problems, stacks
 from tests.baselines import data_of, trained
 
@@ -107,7 +107,7 @@ def test_another_process_loads_the_same_posteriors(tmp_path: Path) -> None:
         (PriorPosterior(problems.box(2)), x_o[:2]),
     ]
     for number, (posterior, x) in enumerate(cases):
-        posterior.save(tmp_path / f"{number}.pt")
+        save(posterior, tmp_path / f"{number}.pt")
         torch.save((x, *numbers(posterior, x)), tmp_path / f"{number}.expected")
     result = subprocess.run(
         [sys.executable, "-c", FRESH, str(tmp_path)],
@@ -293,15 +293,15 @@ def test_classes_of_the_user_have_to_be_trusted(tmp_path: Path) -> None:
 def test_a_file_is_replaced_only_when_asked_to(tmp_path: Path) -> None:
     path = tmp_path / "new" / "x.pt"
     posterior: Any = PriorPosterior(problems.box(2))
-    posterior.save(path)
+    save(posterior, path)
     before = path.read_bytes()
     with pytest.raises(FileExistsError, match="overwrite=True"):
-        PriorPosterior(problems.box(1)).save(path)
+        save(PriorPosterior(problems.box(1)), path)
     posterior.function = lambda x: x
     with pytest.raises((pickle.PicklingError, AttributeError)):
-        posterior.save(path, overwrite=True)
+        save(posterior, path, overwrite=True)
     assert path.read_bytes() == before
-    PriorPosterior(problems.box(1)).save(path, overwrite=True)
+    save(PriorPosterior(problems.box(1)), path, overwrite=True)
     assert load(path).sample((2,)).shape == (2, 1)
     assert [file.name for file in path.parent.iterdir()] == ["x.pt"]
     with pytest.raises(DataNotFoundError):
@@ -310,7 +310,7 @@ def test_a_file_is_replaced_only_when_asked_to(tmp_path: Path) -> None:
 
 def test_damaged_and_foreign_files_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "x.pt"
-    PriorPosterior(problems.box(2)).save(path)
+    save(PriorPosterior(problems.box(2)), path)
     whole = path.read_bytes()
     number = torch.ones(2).numpy().tobytes()  # the upper bound of the prior
     flipped = whole.replace(number, torch.tensor([1.0, 2.0]).numpy().tobytes())

@@ -19,7 +19,7 @@ from torch import nn
 from torch.distributions import Categorical, MixtureSameFamily, MultivariateNormal
 
 from sbi_rope import RoPE
-from sbi_rope._sbi import (
+from sbi_rope.npe.sbi import (
     embed,
     embedding_of,
     estimator_of,
@@ -27,7 +27,7 @@ from sbi_rope._sbi import (
     headless,
     with_embedding,
 )
-from sbi_rope.errors import UnsupportedPosteriorError
+from sbi_rope.utils.errors import UnsupportedPosteriorError
 from tests import problems
 
 

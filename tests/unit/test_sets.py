@@ -13,11 +13,8 @@ from scipy.stats import chi2
 from torch import Tensor
 
 from sbi_rope import MixturePosterior, StackedPosterior
-from sbi_rope._prior import PriorDistribution
-from sbi_rope._random import seeded
 from sbi_rope.density import Flow
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.sets import (
+from sbi_rope.density.sets import (
     Guarantee,
     MakesSets,
     SetScores,
@@ -27,11 +24,14 @@ from sbi_rope.sets import (
     marginal_scores,
     rank_needed,
 )
+from sbi_rope.npe.prior import PriorDistribution
 from sbi_rope.stacking.weights import fold_weights
+from sbi_rope.utils.errors import InvalidInputError
+from sbi_rope.utils.seeds import seeded
 from tests import gaussian, problems, stacks
 
 # Calibration sets are small here on purpose.
-pytestmark = pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::sbi_rope.utils.errors.RoPEWarning")
 X = torch.tensor([0.5, -1.0])
 
 

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from sbi_rope import RoPE
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.settings import (
+from sbi_rope.utils.errors import InvalidInputError
+from sbi_rope.utils.settings import (
     Count,
     Level,
     NotNegative,

@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from sbi_rope import CalibrationFinetuner, RoPE, parallel
-from sbi_rope.data import Pairs
-from sbi_rope.errors import InvalidInputError, RoPEWarning, SimulationError
-from sbi_rope.simulate import (
+from sbi_rope.data.pairs import Pairs
+from sbi_rope.data.simulate import (
     Moments,
     Simulated,
     Source,
@@ -22,6 +21,7 @@ from sbi_rope.simulate import (
     source_of,
     targets,
 )
+from sbi_rope.utils.errors import InvalidInputError, RoPEWarning, SimulationError
 from tests import gaussian, problems
 
 QUICK = CalibrationFinetuner(max_num_epochs=2)
@@ -222,7 +222,7 @@ def counted(function: Callable[[Any], Any]) -> tuple[Callable[[Any], Any], list[
     return count, rows
 
 
-@pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
+@pytest.mark.filterwarnings("ignore::sbi_rope.utils.errors.RoPEWarning")
 def test_calls_of_the_simulator_are_counted_from_the_first_on() -> None:
     theta, x = gaussian.labelled(10)
     for function in (gaussian.simulator, fails_in_batches):
@@ -239,7 +239,7 @@ def test_calls_of_the_simulator_are_counted_from_the_first_on() -> None:
     assert rope.num_simulator_calls == tried + 2000
 
 
-@pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
+@pytest.mark.filterwarnings("ignore::sbi_rope.utils.errors.RoPEWarning")
 def test_a_budget_is_simulated_once_and_then_used_as_stored_simulations_are() -> None:
     theta, x = gaussian.labelled(10)
     count, rows = counted(gaussian.simulator)
@@ -265,7 +265,7 @@ def test_a_budget_is_simulated_once_and_then_used_as_stored_simulations_are() ->
         RoPE(gaussian.posterior(), simulations=(theta, x), num_simulations=10)
 
 
-@pytest.mark.filterwarnings("ignore::sbi_rope.errors.RoPEWarning")
+@pytest.mark.filterwarnings("ignore::sbi_rope.utils.errors.RoPEWarning")
 def test_simulations_that_were_interrupted_go_on_where_they_were() -> None:
     calls, broken = [], []
 

@@ -10,8 +10,8 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
-from sbi_rope.errors import InvalidInputError, RoPEWarning
 from sbi_rope.stacking import stacking_weights
+from sbi_rope.utils.errors import InvalidInputError, RoPEWarning
 
 # Tight enough to compare weights, not only objectives.
 EXACT = {"tolerance": 1e-9, "max_iterations": 200_000}

@@ -4,9 +4,9 @@ import pytest
 import torch
 from sbi.utils import within_support
 
-from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks import TASKS, get_task, list_tasks
 from sbi_rope.tasks.variants import beta_shaped, with_label_noise
+from sbi_rope.utils.errors import InvalidInputError
 
 
 def test_tasks_are_registered_and_listed_under_their_names() -> None:

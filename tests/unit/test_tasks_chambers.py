@@ -9,12 +9,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from sbi_rope.errors import DataNotFoundError, InvalidInputError
 from sbi_rope.tasks.chambers import (
     find_file,
     read_columns,
     read_images,
 )
+from sbi_rope.utils.errors import DataNotFoundError, InvalidInputError
 
 DATASET = "lt_camera_v1"
 SENSORS = "lt_interventions_standard_v1"

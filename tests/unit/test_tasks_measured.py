@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from sbi_rope.errors import DataNotFoundError
 from sbi_rope.tasks import get_task
 from sbi_rope.tasks.near_infrared import NearInfraredSimulator, spectra
 from sbi_rope.tasks.ocean_colour import OceanColourSimulator
+from sbi_rope.utils.errors import DataNotFoundError
 from tests.tasks import MEASURED, make, skip_without_data
 
 

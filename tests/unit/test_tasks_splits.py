@@ -4,7 +4,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from sbi_rope.errors import InvalidInputError, RoPEWarning
 from sbi_rope.tasks.splits import (
     MAX_SEED,
     DrawnPairs,
@@ -12,6 +11,7 @@ from sbi_rope.tasks.splits import (
     RecordedPairs,
     stream_of,
 )
+from sbi_rope.utils.errors import InvalidInputError, RoPEWarning
 
 SEEDS = [0, 1, 2, 3, 100, MAX_SEED - 2, MAX_SEED - 1]
 

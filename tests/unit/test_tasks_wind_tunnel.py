@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 from torch.distributions import Normal
 
-from sbi_rope.errors import InvalidInputError
 from sbi_rope.tasks.wind_tunnel import DATASET, EXPERIMENT, WindTunnel
 from sbi_rope.tasks.wind_tunnel_model import (
     SAMPLE_TIMES,
     WindTunnelSimulator,
     pressure_ratio,
 )
+from sbi_rope.utils.errors import InvalidInputError
 from tests.tasks import all_recorded
 
 # The published columns around those that are read.

@@ -8,12 +8,9 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.tensors import (
-    as_batch,
-    as_numbers,
-    check_in_support,
-)
+from sbi_rope.npe.prior import check_in_support
+from sbi_rope.utils.errors import InvalidInputError
+from sbi_rope.utils.tensors import as_batch, as_numbers
 from tests.refusals import assert_refused
 
 X = torch.tensor([[0.1, 0.9], [0.2, 0.8], [0.3, 0.7]])

@@ -12,13 +12,13 @@ from sbi.inference import NPE
 from sbi.neural_nets import posterior_nn
 from torch import Tensor, nn
 
-from sbi_rope._sbi import SimulationTrainer
 from sbi_rope.baselines import Training
-from sbi_rope.fit import History
-from sbi_rope.trainers.training import (
+from sbi_rope.methods.training import (
+    SimulationTrainer,
     estimator_builder,
     train_on_simulations,
 )
+from sbi_rope.training.fit import History
 from tests.problems import box, simulate
 
 pytestmark = [

@@ -12,12 +12,10 @@ from pathlib import Path
 
 import torch
 
-from sbi_rope.errors import RoPEError
 from sbi_rope.tasks.hemodynamics.dataset import load
 from sbi_rope.tasks.hemodynamics.generation import generate
 from sbi_rope.tasks.hemodynamics.population import NUISANCES, PROCESSES, Population
-
-__all__ = ["main"]
+from sbi_rope.utils.errors import RoPEError
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

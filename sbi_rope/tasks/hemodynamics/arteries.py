@@ -18,26 +18,6 @@ from pathlib import Path
 
 import numpy as np
 
-__all__ = [
-    "AORTIC_ROOT",
-    "BEDS",
-    "CAROTID_PATH",
-    "DENSITY",
-    "FEMORAL_PATH",
-    "LARGE_RADIUS",
-    "LEFT_BRACHIAL",
-    "LEFT_RADIAL",
-    "MIN_VISCOUS_LENGTH",
-    "MMHG",
-    "PROFILE_EXPONENT",
-    "SEGMENTS",
-    "VISCOSITY",
-    "WALL_K1",
-    "WALL_K2",
-    "WALL_VISCOSITY",
-    "WALL_VISCOSITY_SLOPE",
-]
-
 MMHG = 133.322  # Pa
 
 DENSITY = 1060.0  # of blood, kg m^-3

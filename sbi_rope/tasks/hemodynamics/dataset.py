@@ -10,10 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_rope.errors import DataNotFoundError, InvalidInputError
 from sbi_rope.tasks.hemodynamics.population import Process
-
-__all__ = ["FORMAT_VERSION", "BeatSet", "load"]
+from sbi_rope.utils.errors import DataNotFoundError, InvalidInputError
 
 FORMAT_VERSION = 1
 COMMAND = "python -m sbi_rope.tasks.hemodynamics generate"

@@ -4,17 +4,13 @@ import json
 import re
 from collections import Counter
 from dataclasses import asdict
-from importlib import import_module
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import joblib
 import numpy as np
 
-from sbi_rope._files import write_atomically
-from sbi_rope._progress import progress_bar
-from sbi_rope.errors import InvalidInputError, SimulationError
-from sbi_rope.settings import Count, Whole, check, one_of
 from sbi_rope.tasks.hemodynamics.dataset import FORMAT_VERSION, BeatSet, load
 from sbi_rope.tasks.hemodynamics.population import (
     NUISANCES,
@@ -24,8 +20,10 @@ from sbi_rope.tasks.hemodynamics.population import (
 )
 from sbi_rope.tasks.hemodynamics.subject import Physics
 from sbi_rope.tasks.hemodynamics.waveforms import simulate_beat
-
-__all__ = ["generate"]
+from sbi_rope.utils.errors import InvalidInputError, SimulationError
+from sbi_rope.utils.files import write_atomically
+from sbi_rope.utils.progress import progress_bar
+from sbi_rope.utils.settings import Count, Whole, check, one_of
 
 # A process that rejects this many more people than it accepts is not worth the wait.
 MAX_REJECTED = 200
@@ -78,7 +76,7 @@ def generate(
     settings = {
         "format": FORMAT_VERSION,
         # Imported long ago; at the top of this module it would close a circle.
-        "version": import_module("sbi_rope").__version__,
+        "version": metadata.version("sbi-rope"),
         "process": process,
         "n": int(n),
         "seed": int(seed),

@@ -12,8 +12,6 @@ import numpy as np
 
 from sbi_rope.tasks.hemodynamics.network import Network
 
-__all__ = ["ELASTIC", "NO_PARTNER", "SOURCE", "Grid", "State", "build_grid"]
-
 NO_PARTNER, SOURCE = -1, -2  # instead of a face
 ELASTIC = 1e30  # inverse viscosity of an elastic wall: no viscous pressure results
 

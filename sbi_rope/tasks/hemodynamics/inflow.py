@@ -8,8 +8,6 @@ import numpy as np
 
 from sbi_rope.tasks.hemodynamics.subject import Subject
 
-__all__ = ["aortic_inflow"]
-
 # Flow through the aortic valve in arbitrary units, every 3 ms from its opening on: the
 # waveform of Mynard and Smolich (2015, https://doi.org/10.1007/s10439-015-1313-8) as
 # published with pwdb (see arteries.py), which has a value every ms. A cubic spline

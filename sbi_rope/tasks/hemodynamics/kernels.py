@@ -12,8 +12,6 @@ from numba import njit
 
 from sbi_rope.tasks.hemodynamics.grid import SOURCE, Grid, State
 
-__all__ = ["run_cycle"]
-
 # Weight of the new flow in the viscous pressure: 1/2 is of second order, but lets the
 # shortest waves ring.
 IMPLICIT = 0.55

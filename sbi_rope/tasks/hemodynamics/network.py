@@ -5,12 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq
 
-from sbi_rope.errors import SimulationError
 from sbi_rope.tasks.hemodynamics import arteries
 from sbi_rope.tasks.hemodynamics.arteries import MMHG
 from sbi_rope.tasks.hemodynamics.subject import Physics, Subject
-
-__all__ = ["Network", "Outlets", "build_network", "carotid_femoral_velocity"]
+from sbi_rope.utils.errors import SimulationError
 
 ML = 1e-6  # m^3
 # Range that the stiffness k3 of large arteries is sought in, kg s^-2 m^-1. The wave

@@ -7,18 +7,9 @@ from typing import Annotated, Literal
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from sbi_rope.settings import Range, Settings
 from sbi_rope.tasks.hemodynamics import population_tables as tables
 from sbi_rope.tasks.hemodynamics.subject import NUM_SEGMENTS, Subject
-
-__all__ = [
-    "NUISANCES",
-    "PROCESSES",
-    "Population",
-    "Process",
-    "ejection_time_slopes",
-    "truncated_normal",
-]
+from sbi_rope.utils.settings import Range, Settings
 
 Process = Literal["simulator", "real"]
 PROCESSES = ("simulator", "real")

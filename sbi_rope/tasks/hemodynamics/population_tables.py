@@ -11,20 +11,6 @@ References:
 
 import numpy as np
 
-__all__ = [
-    "AGES",
-    "aorta_growth",
-    "compliance_mean",
-    "diameter_growth",
-    "diastolic_pressure",
-    "heart_rate_mean",
-    "pressure_law",
-    "stroke_volume_law",
-    "velocity_quantiles",
-    "velocity_trend",
-    "weissler_time",
-]
-
 AGES = (25.0, 75.0)  # years
 MODEL_AGE = 25.0  # whose arteries are those of the table of segments
 

@@ -10,8 +10,6 @@ from torch.nn.functional import logsigmoid
 
 from sbi_rope.tasks.hemodynamics.prior_table import Band, prior_table
 
-__all__ = ["PopulationPrior"]
-
 # Nearest relative distance to the edges of the support of draws and of what real
 # numbers are mapped to: several units in the last place of a float32, so that rounding
 # takes none of them outside.

@@ -14,8 +14,6 @@ from sbi_rope.tasks.hemodynamics.population import (
     ejection_time_slopes,
 )
 
-__all__ = ["Band", "PriorTable", "prior_table"]
-
 GRID = (257, 129)  # points across stroke volumes, and along ejection times
 NUM_AGES = 96
 MARGINAL_POINTS = 2049

@@ -6,9 +6,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from sbi_rope.settings import NotNegative, Settings
-
-__all__ = ["NUM_STEPS", "SAMPLE_RATE", "Recorder"]
+from sbi_rope.utils.settings import NotNegative, Settings
 
 SAMPLE_RATE = 125.0  # Hz
 NUM_STEPS = 1000  # eight seconds

@@ -5,11 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from sbi_rope.errors import SimulationError
 from sbi_rope.tasks.hemodynamics.grid import Grid, State, build_grid
 from sbi_rope.tasks.hemodynamics.network import Network
-
-__all__ = ["Flow", "Site", "solve"]
+from sbi_rope.utils.errors import SimulationError
 
 Site = tuple[int, float]
 

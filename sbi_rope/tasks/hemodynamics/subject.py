@@ -5,9 +5,7 @@ from typing import Annotated
 
 import numpy as np
 
-from sbi_rope.settings import Positive, Range, Settings, UnitInterval
-
-__all__ = ["NUM_SEGMENTS", "Beat", "Physics", "Subject"]
+from sbi_rope.utils.settings import Positive, Range, Settings, UnitInterval
 
 NUM_SEGMENTS = 116
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from sbi_rope.errors import InvalidInputError
+from sbi_rope.npe.prior import check_in_support
 from sbi_rope.tasks.base import Task
 from sbi_rope.tasks.hemodynamics.dataset import BeatSet, load
 from sbi_rope.tasks.hemodynamics.population import Process
@@ -15,9 +15,8 @@ from sbi_rope.tasks.hemodynamics.records import NUM_STEPS, Normalisation, Record
 from sbi_rope.tasks.networks import SeriesEmbedding, light_series_embedding
 from sbi_rope.tasks.settings import PaperSettings
 from sbi_rope.tasks.splits import DrawnPairs, Part, RecordedPairs, generator_of
-from sbi_rope.tensors import as_batch, check_in_support
-
-__all__ = ["Hemodynamics", "NearestBeatSimulator"]
+from sbi_rope.utils.errors import InvalidInputError
+from sbi_rope.utils.tensors import as_batch
 
 SHIPPED = Path(__file__).parent / "data"
 CHUNK_SIZE = 1000  # parameters that are looked up together

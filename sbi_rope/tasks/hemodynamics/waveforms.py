@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from sbi_rope.errors import SimulationError
 from sbi_rope.tasks.hemodynamics.arteries import (
     AORTIC_ROOT,
     LEFT_BRACHIAL,
@@ -13,8 +12,7 @@ from sbi_rope.tasks.hemodynamics.inflow import aortic_inflow
 from sbi_rope.tasks.hemodynamics.network import Network, build_network
 from sbi_rope.tasks.hemodynamics.solver import Flow, mean_stored_pressure, solve
 from sbi_rope.tasks.hemodynamics.subject import Beat, Physics, Subject
-
-__all__ = ["NUM_PHASES", "SITES", "simulate_beat", "simulate_sites"]
+from sbi_rope.utils.errors import SimulationError
 
 NUM_PHASES = 256
 # Segments count from 0 here.

@@ -8,11 +8,11 @@ MNPE does not have.
 
 import copy
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
-from sbi.inference import NPE, DirectPosterior, VectorFieldPosterior
+from sbi.inference import DirectPosterior, VectorFieldPosterior
 from sbi.inference.posteriors.base_posterior import NeuralPosterior as NeuralPosterior
 from sbi.inference.posteriors.filtered_direct_posterior import FilteredDirectPosterior
 from sbi.inference.posteriors.npe_a_posterior import NPE_A_Posterior
@@ -35,24 +35,18 @@ from sbi.neural_nets.net_builders.flow import (
 )
 from sbi.samplers.mcmc import SliceSamplerVectorized as SliceSamplerVectorized
 from sbi.utils.sbiutils import ImproperEmpirical, Standardize
-from sbi.utils.user_input_checks_utils import (
-    move_distribution_to_device as move_distribution_to_device,
-)
 from torch import Tensor, nn
 from torch.distributions import Distribution
-from torch.utils.data import DataLoader, SubsetRandomSampler
 
-from sbi_rope._prior import PriorDistribution
-from sbi_rope._progress import progress_bar
-from sbi_rope._random import seeded
-from sbi_rope.data import groups_to_hold_out
-from sbi_rope.errors import (
+from sbi_rope.npe.prior import PriorDistribution
+from sbi_rope.utils.errors import (
     InvalidInputError,
     LogProbUnavailableError,
     UnsupportedPosteriorError,
 )
-from sbi_rope.settings import names_of
-from sbi_rope.tensors import as_batch, rows_with
+from sbi_rope.utils.seeds import seeded
+from sbi_rope.utils.settings import names_of
+from sbi_rope.utils.tensors import as_batch, rows_with
 
 # A row may differ by this share of the largest embedding when it is alone. Rounding
 # depends on the size of a batch, and is largest for convolutions on a GPU.
@@ -590,115 +584,6 @@ class TrainedNPE:
     def readable(self, x: Tensor) -> Tensor:
         """Tell which observations h can read, ``(n,)``; some nets can read NaN."""
         return readable(self.h, x)
-
-
-# --- training ---
-
-
-class SimulationTrainer(NPE):
-    """sbi's NPE, which holds simulations of the same parameters out together.
-
-    A network can learn a few stored people that are recorded many times by heart; only
-    people it has not met say when to stop. Recordings of a single person are split one
-    by one. It shows a progress bar on stderr, or nothing, where sbi prints to stdout.
-
-    Args:
-        change_x: Applied to the x of every batch before its loss is taken.
-        penalty: Of the estimator, a term that is added to the loss of every training
-            batch; None adds nothing.
-        **options: Those of NPE.
-    """
-
-    def __init__(
-        self,
-        *,
-        change_x: Callable[[Tensor], Tensor] | None = None,
-        penalty: Callable[[Any], Tensor | None] | None = None,
-        **options: Any,
-    ) -> None:
-        super().__init__(tracker=_NoTracker(), **options)
-        self._change_x = change_x
-        self._penalty = penalty
-        self._bar: Any = None
-
-    def get_dataloaders(
-        self,
-        starting_round: int = 0,
-        training_batch_size: int = 200,
-        validation_fraction: float = 0.1,
-        resume_training: bool = False,  # noqa: FBT001, FBT002
-        dataloader_kwargs: dict[str, Any] | None = None,
-    ) -> tuple[Any, Any]:
-        """Return what to train on and what is held out, batch by batch."""
-        theta = self.get_simulations(starting_round)[0]
-        split = None if resume_training else _split_by(theta, validation_fraction)
-        if split is not None:
-            # sbi takes the rows of a training it resumes as they are.
-            self.train_indices, self.val_indices = split
-            resume_training = True
-            # sbi makes no smaller batch of what is left over.
-            training_batch_size = min(training_batch_size, len(split[0]))
-        train, held_out = super().get_dataloaders(
-            starting_round,
-            training_batch_size,
-            validation_fraction,
-            resume_training,
-            dataloader_kwargs,
-        )
-        if split is not None and not len(held_out):
-            rows: Any = SubsetRandomSampler(split[1].tolist())
-            held_out = DataLoader(held_out.dataset, len(split[1]), sampler=rows)
-        return train, held_out
-
-    def _maybe_show_progress(self, show: bool, epoch: int) -> None:  # type: ignore[override]  # noqa: FBT001
-        if self._bar is None:
-            self._bar = progress_bar(show=show, desc="Training NPE", unit=" epochs")
-        self._bar.update()
-
-    def _report_convergence_at_end(self, epoch: int, max_num_epochs: int) -> None:
-        self._bar.close()
-        if epoch > max_num_epochs:  # sbi warns of that, and prints otherwise
-            super()._report_convergence_at_end(epoch, max_num_epochs)
-
-    def _loss(self, theta: Tensor, x: Tensor, *args: Any, **kwargs: Any) -> Tensor:
-        if self._change_x is not None:
-            x = self._change_x(x)
-        loss, net = super()._loss(theta, x, *args, **kwargs), self._neural_net
-        assert net is not None
-        penalty = self._penalty(net) if self._penalty and net.training else None
-        return loss if penalty is None else loss + penalty
-
-
-def _split_by(
-    theta: Tensor, validation_fraction: float
-) -> tuple[Tensor, Tensor] | None:
-    """Split rows by their parameters; None if no two rows share theirs, or all do."""
-    groups, of_row = theta.unique(dim=0, return_inverse=True)
-    if len(groups) in (1, len(theta)):
-        return None
-    num_held_out = len(theta) - int((1 - validation_fraction) * len(theta))
-    order = torch.randperm(len(groups), device=theta.device)
-    sizes = torch.bincount(of_row)[order]
-    rows = sizes.cumsum(0)
-    # As many groups as it takes to fill what sbi makes room for.
-    num_groups = int((rows < num_held_out).sum()) + 1
-    held_out_groups = order[:num_groups]
-    if rows[num_groups - 1] > len(theta) / 2:  # the last of them is a large one
-        chosen = groups_to_hold_out(num_held_out, sizes.tolist())
-        held_out_groups = order[chosen]
-    held_out = torch.isin(of_row, held_out_groups)
-    return (~held_out).nonzero()[:, 0], held_out.nonzero()[:, 0]
-
-
-class _NoTracker:
-    """Keeps sbi from writing a folder of logs next to the user's work."""
-
-    log_dir = None
-
-    def flush(self, *args: Any, **kwargs: Any) -> None:
-        """Do nothing."""
-
-    log_metric = log_metrics = log_params = add_figure = flush
 
 
 def squared_mmd(a: Tensor, b: Tensor) -> float:

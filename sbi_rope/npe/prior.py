@@ -5,11 +5,13 @@ from functools import cached_property
 from typing import Any
 
 import torch
+from sbi.utils.user_input_checks_utils import move_distribution_to_device
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
-from sbi_rope._random import seeded
-from sbi_rope.errors import InvalidInputError, shown
+from sbi_rope.utils.errors import InvalidInputError, shown
+from sbi_rope.utils.seeds import seeded
+from sbi_rope.utils.tensors import rows_with
 
 # Draws from which moments are estimated that a prior does not state, and those that are
 # moved apart to see whether it has bounds.
@@ -52,8 +54,6 @@ class PriorDistribution(Distribution):
 
     def to(self, device: Any) -> None:
         """Move the prior to a device."""
-        from sbi_rope._sbi import move_distribution_to_device
-
         self._own = move_distribution_to_device(self._own, device)
         self._some = self._some.to(device)
 
@@ -161,9 +161,21 @@ class PriorDistribution(Distribution):
         return std.log().where((std > 0) & torch.isfinite(std), torch.nan)
 
 
-def divisors(std: Tensor) -> Tensor:
-    """Return standard deviations, or variances, with one in the place of zero."""
-    return std.where(std > 0, 1.0)
+def check_in_support(
+    name: str, theta: Tensor, prior: Any, *, rows: Tensor | None = None
+) -> None:
+    """Raise if a row of ``theta``, or one of those ``rows``, has no prior density."""
+    if rows is None:
+        rows = torch.ones(len(theta), dtype=torch.bool, device=theta.device)
+    outside = torch.zeros_like(rows)
+    if rows.any():
+        outside[rows] = ~PriorDistribution(prior).inside(theta[rows])
+    if outside.any():
+        raise InvalidInputError(
+            f"Expected `{name}` inside the support of the prior; got "
+            f"{rows_with(outside)} outside. Check the units and the order of the "
+            "parameters, and give noisy labels with `theta_std`."
+        )
 
 
 def _base_of(support: Any) -> Any:

@@ -4,18 +4,22 @@ A group is held out as a whole, because a network can learn by heart whom it has
 """
 
 import math
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
-from sbi_rope._random import seeded
-from sbi_rope.errors import InvalidInputError
+from sbi_rope.utils.errors import InvalidInputError, RoPEWarning, warn_user
+from sbi_rope.utils.seeds import seeded
 
 # Fewer groups than this leave nothing to hold out.
 MIN_PAIRS_FOR_HOLDOUT = 5
+# Without a hold-out nothing says when to stop, so little is risked.
+EPOCHS_WITHOUT_HOLDOUT = 50
 
 Table = TypeVar("Table")
 
@@ -352,3 +356,26 @@ def _map(function: Callable[..., Any], first: Table, *others: Table) -> Table:
     names = [field.name for field in fields(first)]  # type: ignore[arg-type]
     columns = [[getattr(one, name) for one in (first, *others)] for name in names]
     return type(first)(**{n: function(*c) for n, c in zip(names, columns, strict=True)})
+
+
+def epochs_on_pairs(
+    theta_or_groups: Tensor, held_out: Tensor, max_num_epochs: int
+) -> int:
+    """Return how many epochs to train on pairs for; few, and warn, without hold-out."""
+    if len(held_out):
+        return max_num_epochs
+    warn_user(
+        f"{too_few_pairs(theta_or_groups)}: none is held out, and tuning stops after "
+        f"at most {EPOCHS_WITHOUT_HOLDOUT} epochs. Append at least "
+        f"{MIN_PAIRS_FOR_HOLDOUT} pairs of different parameters to choose the best net "
+        "on a hold-out."
+    )
+    return min(max_num_epochs, EPOCHS_WITHOUT_HOLDOUT)
+
+
+@contextmanager
+def without_warning_of_few_pairs() -> Iterator[None]:
+    """Train on some of the user's pairs, whose number the user did not choose."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Only .* none is held out", RoPEWarning)
+        yield

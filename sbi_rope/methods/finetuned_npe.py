@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from sbi_rope._sbi import check_density, estimator_of, posterior_from
-from sbi_rope._standardisation import warn_of_far_entries
-from sbi_rope.data import MIN_PAIRS_FOR_HOLDOUT, Nodes
+from sbi_rope.data.pairs import MIN_PAIRS_FOR_HOLDOUT, Nodes, epochs_on_pairs
 from sbi_rope.density import Flow, MixturePosterior
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.finetuning import FINETUNING, best_rates, finetune_flow
-from sbi_rope.fit import History, Training, epochs_on_pairs
-from sbi_rope.settings import Count, check
-from sbi_rope.trainers.base import Method
-from sbi_rope.trainers.training import EstimatorBuilder
+from sbi_rope.methods.base import Method
+from sbi_rope.methods.training import EstimatorBuilder
+from sbi_rope.npe.sbi import check_density, estimator_of, posterior_from
+from sbi_rope.npe.standardisation import warn_of_far_entries
+from sbi_rope.rope.finetuning import FINETUNING, best_rates, finetune_flow
+from sbi_rope.training.fit import History, Training
+from sbi_rope.utils.errors import InvalidInputError
+from sbi_rope.utils.settings import Count, check
 
 if TYPE_CHECKING:
     from typing_extensions import Self

@@ -1,7 +1,6 @@
 """The one loop in which all networks of this package are trained."""
 
 import math
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
@@ -10,14 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._progress import progress_bar
-from sbi_rope.data import MIN_PAIRS_FOR_HOLDOUT, too_few_pairs
-from sbi_rope.ensemble import resize
-from sbi_rope.errors import RoPEWarning, warn_user
-from sbi_rope.settings import Count, Level, Positive, Settings
+from sbi_rope.training.ensemble import resize
+from sbi_rope.utils.errors import warn_user
+from sbi_rope.utils.progress import progress_bar
+from sbi_rope.utils.settings import Count, Level, Positive, Settings
 
-# Without a hold-out nothing says when to stop, so little is risked.
-EPOCHS_WITHOUT_HOLDOUT = 50
 # More epochs than this are no limit.
 LARGEST_LIMIT = 10**6
 # A course that made the loss worse is repeated from the better state with this share of
@@ -347,26 +343,3 @@ def differentiable(module: nn.Module) -> Iterator[None]:
 def shuffled(rows: Tensor, size: int) -> Iterator[Tensor]:
     """Pass over rows in random order, in batches of a size."""
     yield from rows[torch.randperm(len(rows)).to(rows.device)].split(size)
-
-
-def epochs_on_pairs(
-    theta_or_groups: Tensor, held_out: Tensor, max_num_epochs: int
-) -> int:
-    """Return how many epochs to train on pairs for; few, and warn, without hold-out."""
-    if len(held_out):
-        return max_num_epochs
-    warn_user(
-        f"{too_few_pairs(theta_or_groups)}: none is held out, and tuning stops after "
-        f"at most {EPOCHS_WITHOUT_HOLDOUT} epochs. Append at least "
-        f"{MIN_PAIRS_FOR_HOLDOUT} pairs of different parameters to choose the best net "
-        "on a hold-out."
-    )
-    return min(max_num_epochs, EPOCHS_WITHOUT_HOLDOUT)
-
-
-@contextmanager
-def without_warning_of_few_pairs() -> Iterator[None]:
-    """Train on some of the user's pairs, whose number the user did not choose."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Only .* none is held out", RoPEWarning)
-        yield

@@ -10,18 +10,16 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._progress import is_shown
-from sbi_rope._random import seeded
-from sbi_rope._sbi import embed, has_parameters
-from sbi_rope.data import Nodes, split_pairs
+from sbi_rope.data.pairs import Nodes, epochs_on_pairs, split_pairs
 from sbi_rope.density.flow import Flow
-from sbi_rope.ensemble import Ensemble, embedded
-from sbi_rope.errors import warn_user
-from sbi_rope.fit import History, Training, epochs_on_pairs, fit
-from sbi_rope.settings import Count, NotNegative, Positive, Range, Settings, check
-from sbi_rope.tensors import as_batch
-
-__all__ = ["CalibrationFinetuner", "FinetuneResult", "History"]
+from sbi_rope.npe.sbi import embed, has_parameters
+from sbi_rope.training.ensemble import Ensemble, embedded
+from sbi_rope.training.fit import History, Training, fit
+from sbi_rope.utils.errors import warn_user
+from sbi_rope.utils.progress import is_shown
+from sbi_rope.utils.seeds import seeded
+from sbi_rope.utils.settings import Count, NotNegative, Positive, Range, Settings, check
+from sbi_rope.utils.tensors import as_batch
 
 # The number of simulations to rehearse with, and how many of them each epoch uses.
 NUM_REHEARSED = 2000

@@ -12,13 +12,13 @@ from scipy.stats import kstest
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_rope._prior import divisors
-from sbi_rope._progress import progress_bar
-from sbi_rope._random import seeded
-from sbi_rope.data import Pairs
-from sbi_rope.errors import InvalidInputError, SimulationError, warn_user
-from sbi_rope.settings import Count, check
-from sbi_rope.tensors import as_batch, as_numbers, check_in_support
+from sbi_rope.data.pairs import Pairs
+from sbi_rope.npe.prior import check_in_support
+from sbi_rope.utils.errors import InvalidInputError, SimulationError, warn_user
+from sbi_rope.utils.progress import progress_bar
+from sbi_rope.utils.seeds import seeded
+from sbi_rope.utils.settings import Count, check
+from sbi_rope.utils.tensors import as_batch, as_numbers, divisors
 
 Embed = Callable[[Tensor], Tensor]
 # Tells which simulations an embedding net can read, ``(n, *event)`` to ``(n,)``.

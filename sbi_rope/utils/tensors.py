@@ -7,8 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_rope._prior import PriorDistribution
-from sbi_rope.errors import InvalidInputError
+from sbi_rope.utils.errors import InvalidInputError
 
 
 def as_batch(
@@ -97,23 +96,6 @@ def column_names(value: Any) -> tuple[str, ...] | None:
     return names if names and are_names and len(set(names)) == len(names) else None
 
 
-def check_in_support(
-    name: str, theta: Tensor, prior: Any, *, rows: Tensor | None = None
-) -> None:
-    """Raise if a row of ``theta``, or one of those ``rows``, has no prior density."""
-    if rows is None:
-        rows = torch.ones(len(theta), dtype=torch.bool, device=theta.device)
-    outside = torch.zeros_like(rows)
-    if rows.any():
-        outside[rows] = ~PriorDistribution(prior).inside(theta[rows])
-    if outside.any():
-        raise InvalidInputError(
-            f"Expected `{name}` inside the support of the prior; got "
-            f"{rows_with(outside)} outside. Check the units and the order of the "
-            "parameters, and give noisy labels with `theta_std`."
-        )
-
-
 def check_same_length(theta: Tensor, x: Tensor) -> None:
     """Raise if parameters and observations have different numbers of rows."""
     if len(theta) != len(x):
@@ -121,6 +103,11 @@ def check_same_length(theta: Tensor, x: Tensor) -> None:
             "Expected `theta` and `x` to have the same number of rows; got "
             f"{len(theta)} and {len(x)}."
         )
+
+
+def divisors(std: Tensor) -> Tensor:
+    """Return standard deviations, or variances, with one in the place of zero."""
+    return std.where(std > 0, 1.0)
 
 
 def rows_with(bad: Tensor) -> str:

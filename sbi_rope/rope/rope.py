@@ -9,33 +9,38 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._progress import is_shown
-from sbi_rope._random import seeded
-from sbi_rope._sbi import TrainedNPE, embed
-from sbi_rope._standardisation import Standardisation, warn_of_far_entries
 from sbi_rope.coupling import Coupling, SinkhornCoupler
-from sbi_rope.data import Pairs, effective_number
-from sbi_rope.density import Coupled, MixturePosterior
-from sbi_rope.discrepancy.correction import tuning_targets
-from sbi_rope.discrepancy.parameters import is_improbable, probability_of_prior
-from sbi_rope.errors import (
-    CouplingError,
-    InvalidInputError,
-    NotReadyError,
-    UnsupportedPosteriorError,
-    warn_user,
-)
-from sbi_rope.finetuning import CalibrationFinetuner, History
-from sbi_rope.labels import (
+from sbi_rope.data.labels import (
     draws_of,
     given_groups,
     given_labels,
     given_weights,
     on_bounds,
 )
-from sbi_rope.settings import Count, check
-from sbi_rope.simulate import Source, moments, source_of, targets
-from sbi_rope.tensors import as_numbers, check_same_length, column_names, rows_with
+from sbi_rope.data.pairs import Pairs, effective_number
+from sbi_rope.data.parameters import is_improbable, probability_of_prior
+from sbi_rope.data.simulate import Source, moments, source_of, targets
+from sbi_rope.density import Coupled, MixturePosterior
+from sbi_rope.discrepancy.correction import tuning_targets
+from sbi_rope.npe.sbi import TrainedNPE, embed
+from sbi_rope.npe.standardisation import Standardisation, warn_of_far_entries
+from sbi_rope.rope.finetuning import CalibrationFinetuner, History
+from sbi_rope.utils.errors import (
+    CouplingError,
+    InvalidInputError,
+    NotReadyError,
+    UnsupportedPosteriorError,
+    warn_user,
+)
+from sbi_rope.utils.progress import is_shown
+from sbi_rope.utils.seeds import seeded
+from sbi_rope.utils.settings import Count, check
+from sbi_rope.utils.tensors import (
+    as_numbers,
+    check_same_length,
+    column_names,
+    rows_with,
+)
 
 # The number of simulations to couple with if the batch has fewer observations.
 MIN_SIMULATIONS = 1000

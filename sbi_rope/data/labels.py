@@ -20,12 +20,12 @@ import torch
 from torch import Tensor
 from torch.distributions import Chi2, MultivariateNormal
 
-from sbi_rope._prior import PriorDistribution
-from sbi_rope._random import seeded
-from sbi_rope.data import Labels, Nodes
-from sbi_rope.errors import InvalidInputError, warn_user
-from sbi_rope.settings import default_names
-from sbi_rope.tensors import as_batch, as_numbers, check_in_support, rows_with
+from sbi_rope.data.pairs import Labels, Nodes
+from sbi_rope.npe.prior import PriorDistribution, check_in_support
+from sbi_rope.utils.errors import InvalidInputError, warn_user
+from sbi_rope.utils.seeds import seeded
+from sbi_rope.utils.settings import default_names
+from sbi_rope.utils.tensors import as_batch, as_numbers, rows_with
 
 # A covariance may be this much asymmetric, relative to its diagonal, and a correlation
 # with a smaller eigenvalue than the second number is singular.

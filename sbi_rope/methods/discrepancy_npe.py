@@ -7,16 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._progress import is_shown
-from sbi_rope._random import seeded
-from sbi_rope._sbi import (
-    check_density,
-    embed,
-    embedding_of,
-    estimator_of,
-    posterior_from,
-)
-from sbi_rope._standardisation import warn_of_far_entries
+from sbi_rope.data.simulate import Moments, Source, moments
 from sbi_rope.density import MixturePosterior
 from sbi_rope.discrepancy.correction import (
     Space,
@@ -27,17 +18,24 @@ from sbi_rope.discrepancy.correction import (
 from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.posterior import Discrepancy
 from sbi_rope.discrepancy.report import DiscrepancyReport, report_discrepancy
-from sbi_rope.ensemble import Ensemble
-from sbi_rope.errors import InvalidInputError, NotReadyError
-from sbi_rope.finetuning import TUNING
-from sbi_rope.fit import History, Training
-from sbi_rope.settings import Count, Range, check
-from sbi_rope.simulate import Moments, Source, moments
-from sbi_rope.tensors import as_batch
-from sbi_rope.trainers.base import Method
-from sbi_rope.trainers.training import EstimatorBuilder
-
-__all__ = ["DiscrepancyNPE"]
+from sbi_rope.methods.base import Method
+from sbi_rope.methods.training import EstimatorBuilder
+from sbi_rope.npe.sbi import (
+    check_density,
+    embed,
+    embedding_of,
+    estimator_of,
+    posterior_from,
+)
+from sbi_rope.npe.standardisation import warn_of_far_entries
+from sbi_rope.rope.finetuning import TUNING
+from sbi_rope.training.ensemble import Ensemble
+from sbi_rope.training.fit import History, Training
+from sbi_rope.utils.errors import InvalidInputError, NotReadyError
+from sbi_rope.utils.progress import is_shown
+from sbi_rope.utils.seeds import seeded
+from sbi_rope.utils.settings import Count, Range, check
+from sbi_rope.utils.tensors import as_batch
 
 # Simulations at the parameters of each pair, and copies g with ``space="tuned"``.
 SIMULATIONS_PER_PAIR, NUM_FOLDS = 100, 5

@@ -9,18 +9,9 @@ import torch
 from scipy.stats import t as student
 from torch import Tensor
 
-from sbi_rope._prior import divisors
-from sbi_rope._random import seeded
-from sbi_rope.data import effective_number, group_means, one_of_each_group
-
-__all__ = [
-    "LEVEL",
-    "Estimate",
-    "PermutationTest",
-    "TwoSampleTest",
-    "compare_with_pairs",
-    "permutation_test",
-]
+from sbi_rope.data.pairs import effective_number, group_means, one_of_each_group
+from sbi_rope.utils.seeds import seeded
+from sbi_rope.utils.tensors import divisors
 
 NUM_PERMUTATIONS = 1000
 # So many are made at a time, which takes memory for as many copies of the outcomes.

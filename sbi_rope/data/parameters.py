@@ -9,16 +9,9 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, MultivariateNormal
 
-from sbi_rope._random import seeded
-from sbi_rope.data import Pairs
-from sbi_rope.tensors import as_batch
-
-__all__ = [
-    "ParameterDistribution",
-    "is_improbable",
-    "learn_parameters",
-    "probability_of_prior",
-]
+from sbi_rope.data.pairs import Pairs
+from sbi_rope.utils.seeds import seeded
+from sbi_rope.utils.tensors import as_batch
 
 # Draws of the prior that the parameters of pairs are compared with, and draws of each
 # label that is not exact.

@@ -19,8 +19,8 @@ import zuko.nn
 from nflows.transforms.lu import LULinear
 from torch import Tensor, nn
 
-from sbi_rope._random import seeded
-from sbi_rope.errors import SamplingError
+from sbi_rope.utils.errors import SamplingError
+from sbi_rope.utils.seeds import seeded
 
 # What is asked of a network: its answers to rows. The first argument is the network.
 Question = Callable[..., Tensor]

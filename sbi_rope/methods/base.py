@@ -9,10 +9,15 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
-from sbi_rope._prior import PriorDistribution
-from sbi_rope._progress import is_shown
-from sbi_rope._random import seeded
-from sbi_rope._sbi import (
+from sbi_rope.data.pairs import Pairs
+from sbi_rope.data.simulate import Source, source_of
+from sbi_rope.methods.training import (
+    EstimatorBuilder,
+    estimator_builder,
+    train_on_simulations,
+)
+from sbi_rope.npe.prior import PriorDistribution, check_in_support
+from sbi_rope.npe.sbi import (
     TrainedNPE,
     direct_posterior,
     embedding_of,
@@ -21,17 +26,12 @@ from sbi_rope._sbi import (
     parameter_of,
     readable,
 )
-from sbi_rope.data import Pairs
-from sbi_rope.errors import InvalidInputError, NotReadyError, warn_user
-from sbi_rope.fit import History, Training
-from sbi_rope.settings import check
-from sbi_rope.simulate import Source, source_of
-from sbi_rope.tensors import as_batch, check_in_support, column_names, rows_with
-from sbi_rope.trainers.training import (
-    EstimatorBuilder,
-    estimator_builder,
-    train_on_simulations,
-)
+from sbi_rope.training.fit import History, Training
+from sbi_rope.utils.errors import InvalidInputError, NotReadyError, warn_user
+from sbi_rope.utils.progress import is_shown
+from sbi_rope.utils.seeds import seeded
+from sbi_rope.utils.settings import check
+from sbi_rope.utils.tensors import as_batch, column_names, rows_with
 
 if TYPE_CHECKING:
     from typing_extensions import Self

@@ -7,7 +7,7 @@ from numbers import Integral, Real
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from sbi_rope.errors import InvalidInputError, shown
+from sbi_rope.utils.errors import InvalidInputError, shown
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,8 @@ def check(name: str, value: Any, kind: Any) -> None:
     Example:
         >>> check("tau", 2, UnitInterval)
         Traceback (most recent call last):
-        sbi_rope.errors.InvalidInputError: Expected `tau` to be a number from 0 to 1; \
-got 2.
+        sbi_rope.utils.errors.InvalidInputError: Expected `tau` to be a number from \
+0 to 1; got 2.
     """
     if not _fits(value, kind):
         raise InvalidInputError(

@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor, nn
 
-from sbi_rope._sbi import standardisation_of
-from sbi_rope.errors import warn_user
+from sbi_rope.npe.sbi import standardisation_of
+from sbi_rope.utils.errors import warn_user
 
 # An entry is far if it is more than so many standard deviations away from simulations.
 # No measurement of the tasks is half as far away.

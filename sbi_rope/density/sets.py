@@ -22,13 +22,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_rope._random import seeded
-from sbi_rope._sbi import MixedDensity
-from sbi_rope.errors import InvalidInputError
-from sbi_rope.settings import Count, Level, check, default_names
-from sbi_rope.tensors import as_batch, as_numbers
-
-__all__ = ["CredibleIntervals", "CredibleSet", "Guarantee", "SetScores"]
+from sbi_rope.npe.sbi import MixedDensity
+from sbi_rope.utils.errors import InvalidInputError
+from sbi_rope.utils.seeds import seeded
+from sbi_rope.utils.settings import Count, Level, check, default_names
+from sbi_rope.utils.tensors import as_batch, as_numbers
 
 LOWEST_LEVEL = 0.5  # Below, the guarantee says nothing, and intervals may be empty.
 # A set reaches further than the draws of a stack that is too narrow. To measure it,
@@ -399,7 +397,7 @@ class MakesSets:
         quantile of the log density of draws. It holds the true parameters with
         the probability ``level`` only if the posterior is calibrated. With
         ``guaranteed``, a stack corrects it by its out-of-fold scores, see
-        :class:`~sbi_rope.sets.Guarantee`.
+        :class:`~sbi_rope.density.sets.Guarantee`.
 
         Args:
             level: The probability of the set.

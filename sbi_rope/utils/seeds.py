@@ -7,7 +7,7 @@ from contextlib import contextmanager
 import numpy as np
 import torch
 
-from sbi_rope.settings import Seed, check
+from sbi_rope.utils.settings import Seed, check
 
 
 @contextmanager

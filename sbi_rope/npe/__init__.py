@@ -1,0 +1,1 @@
+"""A trained NPE of sbi, taken apart, its prior, and its units."""
