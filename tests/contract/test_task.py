@@ -1,7 +1,7 @@
 """What every task promises of its prior, its simulator and its network.
 
 Its labelled sets are in ``test_task_sets.py``, the variants that all tasks have in
-``test_task_variants.py``, files of published data in ``test_task_recorded.py``. Bad
+``test_task_variants.py``. Bad
 arguments of the simulators are tried in ``tests/integration/test_bad_inputs.py``.
 """
 

@@ -80,22 +80,6 @@ def test_pulse_wave_velocity_has_the_published_quantiles() -> None:
     assert np.corrcoef(velocity, pressure)[0, 1] > 0.2
 
 
-def test_arteries_change_with_age_as_published(people: dict[str, np.ndarray]) -> None:
-    old, young = people["age"] > 65, people["age"] < 35
-    ratio = {
-        name: values[old].mean() / values[young].mean()
-        for name, values in people.items()
-    }
-    assert ratio["pulse_wave_velocity"] == pytest.approx(9.4 / 6.3, rel=0.08)
-    assert ratio["diameter_factor"] == pytest.approx(1.18 / 1.035, rel=0.03)
-    assert ratio["compliance_factor"] == pytest.approx(0.043 / 0.083, rel=0.08)
-    spread = people["mean_pressure"] - np.interp(
-        people["age"], tables.PRESSURE_AGES, tables.MEAN_PRESSURES
-    )
-    assert spread.std() == pytest.approx(7.3 * TRUNCATED_SD, rel=0.05)
-    assert people["outflow_pressure"].mean() == pytest.approx(33.2, abs=0.4)
-
-
 @pytest.mark.medium
 def test_real_lengths_vary_with_height_and_by_segment() -> None:
     subjects = _draw("real", 1500)

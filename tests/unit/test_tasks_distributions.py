@@ -16,48 +16,12 @@ LAWS = pytest.mark.parametrize("law", [UniformDistance, Arcsine])
 # Both laws ---------------------------------------------------------------------------
 
 
-@pytest.fixture
-def distance() -> UniformDistance:
-    return UniformDistance(torch.tensor([40.0]))
-
-
-def test_the_density_of_a_distance_is_that_of_a_scaled_beta(
-    distance: UniformDistance,
-) -> None:
-    d = torch.linspace(0.1, 39.9, 50)
-    beta = Beta(torch.tensor(1.0), torch.tensor(2.0))
-    expected = beta.log_prob(d / 40) - torch.tensor(40.0).log()
-    torch.testing.assert_close(distance.log_prob(d), expected)
-
-
 @LAWS
 def test_the_density_is_the_derivative_of_the_distribution_function(law: Law) -> None:
     some = law(torch.tensor([40.0], dtype=torch.float64))
     d = torch.linspace(0.5, 39.5, 20, dtype=torch.float64, requires_grad=True)
     (density,) = torch.autograd.grad(some.cdf(d).sum(), d)
     torch.testing.assert_close(density, some.log_prob(d).exp())
-
-
-def test_draws_of_a_distance_are_those_of_uniform_draws(
-    distance: UniformDistance,
-) -> None:
-    draws = distance.sample((20_000,)).flatten()
-    uniform = 40 * torch.rand(2, 20_000) - 15
-    levels = torch.linspace(0.01, 0.99, 50)
-    torch.testing.assert_close(
-        draws.quantile(levels),
-        (uniform[0] - uniform[1]).abs().quantile(levels),
-        atol=0.6,
-        rtol=0.0,
-    )
-
-
-@LAWS
-def test_the_quantile_function_inverts_the_distribution_function(law: Law) -> None:
-    some = law(torch.tensor([40.0]))
-    level = torch.tensor([0.0, 1e-3, 0.3, 0.5, 0.999, 1.0])
-    torch.testing.assert_close(some.cdf(some.icdf(level)), level)
-    assert some.icdf(level[[0, -1]]).tolist() == [0.0, 40.0]
 
 
 # Arcsine -----------------------------------------------------------------------------
@@ -90,17 +54,6 @@ def test_arcsine_density_is_finite_at_its_ends_and_zero_beyond(
     assert (malus.log_prob(beyond) == -torch.inf).all()
     assert malus.support.check(ends).all()
     assert not malus.support.check(beyond).any()
-
-
-def test_arcsine_draws_are_squared_cosines_of_uniform_angles(malus: Arcsine) -> None:
-    draws = malus.sample((20_000,)).flatten()
-    angles = 360 * torch.rand(2, 20_000) - 180
-    squares = torch.deg2rad(angles[0] - angles[1]).cos() ** 2
-    levels = torch.linspace(0.01, 0.99, 50)
-    torch.testing.assert_close(
-        draws.quantile(levels), squares.quantile(levels), atol=0.03, rtol=0.0
-    )
-    assert torch.isfinite(malus.log_prob(draws)).all()
 
 
 # Boxes -------------------------------------------------------------------------------

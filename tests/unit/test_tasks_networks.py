@@ -3,7 +3,6 @@
 from itertools import pairwise
 
 import pytest
-import torch
 from torch import nn
 
 from sbi_rope.tasks import get_task
@@ -53,14 +52,3 @@ def test_layers_are_those_of_the_paper(
         if isinstance(m, nn.Linear)
     ]
     assert linear == list(pairwise(widths))
-
-
-def test_the_number_of_features_follows_the_size_of_what_is_embedded() -> None:
-    for num_steps, num_features in ((200, 2048), (201, 2176), (1000, 14_848)):
-        net = SeriesEmbedding(num_steps=num_steps, padding=1)
-        assert net.num_features == num_features
-        assert net(torch.randn(2, num_steps)).shape == (2, 10)
-    for size, num_features in ((64, 12), (87, 27), (100, 27)):
-        image_net = ImageEmbedding(image_size=size)
-        assert image_net.num_features == num_features
-        assert image_net(torch.rand(2, 3, size, size)).shape == (2, 20)

@@ -21,15 +21,6 @@ def test_positions_are_a_damped_cosine() -> None:
     assert x[1, -1] == pytest.approx(3.0 * math.exp(-5.0))
 
 
-def test_the_noise_has_the_standard_deviation_of_the_sensor() -> None:
-    theta = torch.tensor([[0.0, 2.0]]).expand(1000, -1)
-    # At frequency 0 a series is constant but for the noise at every step.
-    for simulator in (Pendulum().get_simulator(), PendulumSimulator()):
-        x = simulator(theta)
-        noise = x - x.mean(dim=1, keepdim=True)
-        assert noise.std() == pytest.approx(0.1, rel=0.01)
-
-
 def test_phase_is_uniform_on_the_circle() -> None:
     # The swing turns by a quarter in 10 s: first and last position give the phase.
     theta = torch.tensor([[math.pi / 20, 1.0]]).expand(10_000, -1)
