@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: quickstart test test-fast test-slow test-latest-sbi lint types size
+.PHONY: quickstart test test-fast test-slow faults test-latest-sbi lint types size
 .PHONY: docs docs-code docs-site docs-links format clean package
 .PHONY: examples example-quickstart example-tunnel example-tasks example-people
 
@@ -21,6 +21,10 @@ test-fast: $(VENV)/.installed
 
 test-slow: $(VENV)/.installed
 	$(BIN)/python -m pytest -q -m "slow and not gpu and not network"
+
+# Wrong functions, each of which a test has to notice.
+faults: $(VENV)/.installed
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.faults
 
 test-latest-sbi:
 	PYTHON=$(PYTHON) .ci/latest-sbi

@@ -201,7 +201,9 @@ FAULTS = [
     Fault(
         "Blood flows with half of its friction",
         "tasks.hemodynamics.solver:solve",
-        argument(network=lambda network: replace(network, friction=network.friction / 2)),
+        argument(
+            network=lambda network: replace(network, friction=network.friction / 2)
+        ),
         "unit/test_hemodynamics_solver.py",
     ),
     Fault(
@@ -243,16 +245,18 @@ FAULTS = [
     Fault(
         "The test set of a seed is the calibration set of the next",
         "tasks.splits:stream_of",
-        lambda right: lambda seed, use: (
-            right(seed + 1, "calibration") if use == "test" else right(seed, use)
+        lambda right: (
+            lambda seed, use: (
+                right(seed + 1, "calibration") if use == "test" else right(seed, use)
+            )
         ),
         "unit/test_tasks_splits.py",
     ),
     Fault(
         "Recorded calibration pairs are test pairs as well",
         "tasks.splits:RecordedPairs.rows_of",
-        lambda right: lambda self, part: sorted(
-            {*right(self, "calibration"), *right(self, part)}
+        lambda right: (
+            lambda self, part: sorted({*right(self, "calibration"), *right(self, part)})
         ),
         "unit/test_tasks_splits.py",
     ),

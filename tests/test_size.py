@@ -58,10 +58,10 @@ def main() -> None:
         p for p in (ROOT / "sbi_rope").iterdir() if (p / "__init__.py").exists()
     )
     for room in rooms:
-        print(f"{lines_of(f'sbi_rope/{room.name}/*.py'):7,}  sbi_rope/{room.name}")  # noqa: T201
+        print(f"{lines_of(f'sbi_rope/{room.name}/*.py'):7,}  sbi_rope/{room.name}")
     for place, budget in BUDGETS.items():
-        print(f"{lines_of(place):7,}  {place} (at most {budget:,})")  # noqa: T201
-    print(f"{len(checks()):7,}  functions that check or warn (at most {MOST_CHECKS})")  # noqa: T201
+        print(f"{lines_of(place):7,}  {place} (at most {budget:,})")
+    print(f"{len(checks()):7,}  functions that check or warn (at most {MOST_CHECKS})")
 
 
 if __name__ == "__main__":
