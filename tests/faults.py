@@ -24,7 +24,7 @@ from typing import Any
 import pytest
 import torch
 
-import sbi_rope.baselines  # before the processes part
+import sbi_rope.baselines  # noqa: F401  (before the processes part)
 
 TESTS = Path(__file__).parent
 Wrong = Callable[[Any], Any]
