@@ -8,10 +8,9 @@ from scipy.stats import binom
 from torch import Tensor, nn
 
 from sbi_rope.coupling import Coupling
-from sbi_rope.diagnosis.report import UNLIKE_PAIRS, Finding
-from sbi_rope.diagnosis.simulations import Simulations, nearest_distances
+from sbi_rope.diagnosis.report import Finding
+from sbi_rope.diagnosis.simulations import CHUNK, Simulations
 from sbi_rope.metrics.statistics import LEVEL, TwoSampleTest
-from sbi_rope.npe.sbi import squared_mmd
 from sbi_rope.npe.standardisation import FAR, deviations
 
 # The most observations and simulations in one MMD, whose cost is quadratic.
@@ -37,16 +36,9 @@ class MMDTest(NamedTuple):
     usual: float
     p_value: float
 
-    def __str__(self) -> str:
-        ratio = self.mmd / max(self.usual, 1e-300)
-        return (
-            f"its squared MMD is {ratio:.{0 if ratio >= 10 else 1}f} times that of a "
-            f"batch of simulations (p = {self.p_value:.2g})"
-        )
-
 
 def mmd_test(batch: Tensor, simulated: Tensor, *, null: Tensor) -> MMDTest:
-    r"""Test whether a batch is like simulations, with sbi's MMD.
+    r"""Test whether a batch is like simulations, by the maximum mean discrepancy.
 
     At most 200 random rows of the batch ``(n_o, l)`` are used. Under the null
     hypothesis, it has embeddings as in ``null``, one for each simulation ``(n_s, l)``.
@@ -65,51 +57,68 @@ def mmd_test(batch: Tensor, simulated: Tensor, *, null: Tensor) -> MMDTest:
     for i in range(NUM_DRAWS):
         order = torch.randperm(len(simulated))[: num_real + num_simulated]
         real, other = order[:num_real], order[num_real:]
-        usual[i] = squared_mmd(null[real], simulated[other])
+        usual[i] = _squared_mmd(null[real], simulated[other])
     other = torch.randperm(len(simulated))[:num_simulated]
-    value = squared_mmd(chosen, simulated[other])
+    value = _squared_mmd(chosen, simulated[other])
     # The batch itself counts as one of the draws, so that p is never 0.
     p_value = (1 + int((usual >= value).sum())) / (1 + NUM_DRAWS)
     return MMDTest(value, float(usual.median()), p_value)
 
 
+def _squared_mmd(a: Tensor, b: Tensor) -> float:
+    """Return the squared MMD of two sets, Gaussian, of the median width."""
+    within, across, other = torch.cdist(a, a), torch.cdist(a, b), torch.cdist(b, b)
+    aa, ab, bb = (
+        torch.exp(-0.5 * (distance / across.median()).square()).mean()
+        for distance in (within, across, other)
+    )
+    return float(aa + bb - 2 * ab)
+
+
 def before_tuning(test: MMDTest, *, tuned: bool) -> Finding:
     """Say whether h(x_o) is unlike h(x_s), which pairs can repair."""
-    is_unlike = test.p_value < LEVEL
+    advice = "This is what the calibration pairs repair, and no alarm."
+    if not tuned:
+        advice = (
+            "Either the simulator is wrong or the batch has other parameters than the "
+            "prior. Append calibration pairs, which repair the first."
+        )
+    return _of_mmd("before", "NPE", test, advice, is_alarm=not tuned)
+
+
+def after_tuning(test: MMDTest | None) -> Finding:
+    """Say whether tuning has moved the batch among the simulations."""
+    if test is None:
+        why = "there are no calibration pairs"
+        return Finding("misspecification after tuning", f"Not tested, because {why}.")
+    advice = (
+        "Append more calibration pairs like the batch, or lower tau if the batch is "
+        "narrower than the prior or shifted."
+    )
+    return _of_mmd("after", "RoPE's tuned embedding net", test, advice)
+
+
+def _of_mmd(
+    when: str, net: str, test: MMDTest, advice: str, *, is_alarm: bool = True
+) -> Finding:
+    is_unlike, ratio = test.p_value < LEVEL, test.mmd / max(test.usual, 1e-300)
     sentence = f"No sign of it (p = {test.p_value:.2g})."
     if is_unlike:
-        sentence = f"NPE sees the batch as unlike simulations: {test}. " + (
-            "This is what the calibration pairs repair, and no alarm."
-            if tuned
-            else "Either the simulator is wrong or the batch has other parameters than "
-            "the prior. Append calibration pairs, which repair the first."
-        )
-    name, alarming = "misspecification before tuning", is_unlike and not tuned
-    return Finding(name, sentence, alarming, test.p_value, LEVEL)
-
-
-def after_tuning(test: MMDTest | None, before: MMDTest) -> Finding:
-    """Say whether tuning has moved the batch among the simulations."""
-    name = "misspecification after tuning"
-    if test is None:
-        return Finding(name, "Not tested, because there are no calibration pairs.")
-    is_unlike = test.p_value < LEVEL
-    course = f"{before.mmd:.2g} before tuning and {test.mmd:.2g} after"
-    sentence = f"No sign of it (p = {test.p_value:.2g}; the squared MMD is {course})."
-    if is_unlike:
         sentence = (
-            f"RoPE's tuned embedding net sees the batch as unlike simulations: {test}. "
-            f"It is {course}. Append more calibration pairs like the batch, or lower "
-            "tau if the batch is narrower than the prior or shifted."
+            f"{net} sees the batch as unlike simulations: its squared MMD is "
+            f"{ratio:.{0 if ratio >= 10 else 1}f} times that of a batch of simulations "
+            f"(p = {test.p_value:.2g}). {advice}"
         )
-    return Finding(name, sentence, is_unlike, test.p_value, LEVEL)
+    name, alarming = f"misspecification {when} tuning", is_unlike and is_alarm
+    return Finding(name, sentence, alarming, test.p_value, LEVEL)
 
 
 def unlike_pairs(test: TwoSampleTest | None, names: Sequence[str]) -> Finding:
     """Say whether what was found on the pairs holds for the batch."""
+    name = "batch unlike the calibration pairs"
     if test is None:
         few = "five observations and five pairs with different labels (or groups)"
-        return Finding(UNLIKE_PAIRS, f"Not tested, because this needs {few}.")
+        return Finding(name, f"Not tested, because this needs {few}.")
     sentence = f"No sign of it (p = {test.p_value:.2g})."
     if test.is_different:
         found = ", ".join(test.parameters(names))
@@ -120,7 +129,7 @@ def unlike_pairs(test: TwoSampleTest | None, names: Sequence[str]) -> Finding:
             "observations like those of the batch. Weights, scores, calibration and "
             "guarantees that were found on the pairs need not hold here."
         )
-    return Finding(UNLIKE_PAIRS, sentence, test.is_different, test.p_value, LEVEL)
+    return Finding(name, sentence, test.is_different, test.p_value, LEVEL)
 
 
 def far_entries(embedding_net: nn.Module, x_o: Tensor) -> Finding:
@@ -149,15 +158,25 @@ def distances(real: Tensor, simulations: Simulations) -> Tensor:
     observations between simulations, such as between the categories of an entry. The
     limit allows for that.
     """
-    embedded, averaged = simulations.embedded, simulations.averaged
+    embedded = simulations.embedded
     # A new value exceeds the (k+1)-th largest of n with probability (k + 1) / (n + 1).
     k = int(FLAGGED_SHARE * len(embedded))
     limit = max(
-        float(nearest_distances(ends, embedded, others=True).sort().values[-1 - k])
-        for ends in (embedded, averaged)
+        float(_nearest(ends, embedded, others=True).sort().values[-1 - k])
+        for ends in (embedded, simulations.averaged)
     )
-    smallest = torch.finfo(torch.float64).tiny
-    return nearest_distances(real, embedded) / max(limit, smallest)
+    return _nearest(real, embedded) / max(limit, torch.finfo(torch.float64).tiny)
+
+
+def _nearest(points: Tensor, among: Tensor, *, others: bool = False) -> Tensor:
+    """Return the distance to the nearest, or the nearest in any of the other rows."""
+    nearest = []
+    for rows in torch.arange(len(points)).split(CHUNK):
+        distance = torch.cdist(points[rows], among)
+        if others:
+            distance.scatter_(1, rows[:, None], torch.inf)
+        nearest.append(distance.amin(dim=1))
+    return torch.cat(nearest)
 
 
 def unmatched(distance: Tensor, num_simulations: int) -> Finding:

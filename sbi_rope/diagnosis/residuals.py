@@ -5,7 +5,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from sbi_rope.data.pairs import Pairs, one_of_each_group, without_warning_of_few_pairs
+from sbi_rope.data.pairs import (
+    Pairs,
+    group_means,
+    one_of_each_group,
+    without_warning_of_few_pairs,
+)
 from sbi_rope.diagnosis.report import Finding
 from sbi_rope.diagnosis.simulations import Simulations
 from sbi_rope.metrics.statistics import LEVEL, permutation_test
@@ -15,7 +20,10 @@ from sbi_rope.utils.progress import progress_bar
 from sbi_rope.utils.tensors import divisors
 
 NAME = "residual depends on parameters"
-# Averaging over the simulator's noise explains at most this, see `bias_finding`.
+# Averaging over the simulator's noise explains at most this. Let h be the posterior
+# mean of a linear-Gaussian problem that explains a share R of the variance. Residuals
+# of the best g are -R (1 - R) theta, and the noise of simulations has the variance
+# R (1 - R). The ratio is the root of R (1 - R).
 LARGEST_RATIO = 0.5
 # Without noise, a bias is measured in units of this share of the embeddings' spread.
 SMALLEST_SHARE = 0.05
@@ -34,34 +42,26 @@ class HeldOut(NamedTuple):
 
     def mean_of_groups(self, values: Tensor) -> Tensor:
         """Return the mean of each group of values of the pairs, ``(n_c, ...)``."""
-        member = (self.group.unique()[:, None] == self.group).to(values)
-        return torch.tensordot(member / member.sum(dim=1, keepdim=True), values, dims=1)
+        return group_means(values, torch.ones(len(values)), self.group)[0]
 
 
-def num_features(num_pairs: int, dim: int) -> int:
-    """Return how many features of the parameters to regress on; 0 if pairs are few."""
-    return next((p for p in (2 * dim, dim) if num_pairs >= 2 * (p + 1) + 2), 0)
-
-
-def cross_fit(rope: RoPE, *, num_folds: int, show_progress_bars: bool) -> HeldOut:
-    r"""Embed each calibration pair by a g that was trained on the other folds.
+def cross_fit(rope: RoPE, num_folds: int, *, show: bool) -> HeldOut:
+    """Embed each calibration pair by a g that was trained on the other folds.
 
     Where labels are not exact, g is tuned to averages given the label alone, other than
     by :meth:`RoPE.train`: residuals from averages that are also given x would be too
     small, as they would be of pairs that g was trained on.
     """
-    pairs, h = rope.pairs, rope.embedding_net
-    targets = rope.draw_targets(
-        rope.finetuner.simulations_per_target, show_progress_bars=False
-    )
+    pairs, count = rope.pairs, rope.finetuner.simulations_per_target
+    targets = rope.draw_targets(count, show_progress_bars=False)
     embedded = torch.empty_like(targets)
     # Recordings of one person share a fold, as they do in a stack.
     folds = pairs.folds(num_folds)
-    for held_out in progress_bar(folds, show=show_progress_bars, desc="Folds"):
+    for held_out in progress_bar(folds, show=show, desc="Folds"):
         others = torch.cat([fold for fold in folds if fold is not held_out])
         with without_warning_of_few_pairs():
             result = rope.finetuner.finetune(
-                h,
+                rope.embedding_net,
                 pairs.x[others],
                 lambda count, others=others: targets[others],
                 draw_simulations=lambda n: rope.source.from_prior(n, seed=0)[1],
@@ -70,34 +70,33 @@ def cross_fit(rope: RoPE, *, num_folds: int, show_progress_bars: bool) -> HeldOu
                 show_progress_bars=False,
             )
         embedded[held_out] = embed(result.embedding_net, pairs.x[held_out])
-    return HeldOut(
-        embedded=embedded.cpu().double(),
-        targets=targets.cpu().double(),
-        group=pairs.group.cpu(),
-    )
+    moved = (values.cpu().double() for values in (embedded, targets))
+    return HeldOut(*moved, group=pairs.group.cpu())
+
+
+def num_features(num_pairs: int, dim: int) -> int:
+    """Return how many features of the parameters to regress on; 0 if pairs are few."""
+    return next((p for p in (2 * dim, dim) if num_pairs >= 2 * (p + 1) + 2), 0)
 
 
 def dependence(residuals: Tensor, theta: Tensor) -> tuple[float, float, float]:
-    r"""Regress residuals ``(n, l)`` on parameters ``(n, d)`` and their squares.
+    r"""Regress residuals ``(n, l)`` on parameters ``(n, d)``, and squares if n allows.
 
     With p features that explain a sum of squares, and residual variance :math:`s^2`,
     the bias b is estimated by :math:`b^2 = (\text{explained} - p\, s^2) / n`, which is
-    unbiased. If pairs are few, the squares of the parameters are left out. The standard
-    error of b is at most about :math:`\sqrt{(s^2 + b^2 / 2) / n}`, its value if all
-    residual variance has the direction of the bias.
+    unbiased. Its standard error is at most about :math:`\sqrt{(s^2 + b^2 / 2) / n}`.
 
     Returns:
         The p-value of a permutation test, b, and its standard error.
     """
-    count = num_features(*theta.shape)
     standard = (theta - theta.mean(dim=0)) / divisors(theta.std(dim=0))
-    features = torch.cat([standard, standard.square()], dim=1)[:, :count]
-    found = permutation_test(residuals, features)
-    n, p = len(residuals), found.num_features
-    total = float((residuals - residuals.mean(dim=0)).square().sum())
-    variance = (total - found.explained) / (n - 1 - p)
-    square = max(found.explained - p * variance, 0.0) / n
-    return found.p_value, square**0.5, ((variance + square / 2) / n) ** 0.5
+    features = torch.cat([standard, standard.square()], dim=1)
+    features = features[:, : num_features(*theta.shape)]
+    p_value, explained, p = permutation_test(residuals, features)
+    n, total = len(residuals), float((residuals - residuals.mean(dim=0)).square().sum())
+    variance = (total - explained) / (n - 1 - p)
+    square = max(explained - p * variance, 0.0) / n
+    return p_value, square**0.5, ((variance + square / 2) / n) ** 0.5
 
 
 def residual_finding(
@@ -115,21 +114,13 @@ def residual_finding(
     if labels.shape[1] > pairs.num_groups:
         # The mean over parameters that differ would depend on them less.
         chosen = one_of_each_group(held_out.group, seed=0)
-        theta, residuals = theta[chosen], residuals[chosen]
-    else:
-        theta, residuals = map(held_out.mean_of_groups, (theta, residuals))
+        return bias_finding(residuals[chosen], theta[chosen], simulations)
+    theta, residuals = map(held_out.mean_of_groups, (theta, residuals))
     return bias_finding(residuals, theta, simulations)
 
 
 def bias_finding(residuals: Tensor, theta: Tensor, simulations: Simulations) -> Finding:
-    r"""Return a finding about the bias, its lower 95 % limit, in units of the noise.
-
-    Residuals depend on the parameters even if nothing is wrong. Let :math:`h` be the
-    posterior mean of a linear-Gaussian problem that explains a share R of the variance.
-    The residuals of the best g are then :math:`-R (1 - R)\, \theta`, and the noise of
-    simulations has the variance :math:`R (1 - R)`. The ratio is
-    :math:`\sqrt{R (1 - R)} \le 1/2`.
-    """
+    """Return a finding about the bias, its lower 95 % limit, in units of the noise."""
     p_value, bias, error = dependence(residuals, theta)
     spread = float(simulations.embedded.var(dim=0).sum())
     noise = float(simulations.noise.trace())

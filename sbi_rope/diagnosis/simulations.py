@@ -1,4 +1,4 @@
-"""The simulations that a batch is compared with, and the parameters they imply."""
+"""The simulations that a batch is compared with."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -6,15 +6,12 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from sbi_rope.coupling import Coupling
 from sbi_rope.utils.tensors import divisors
 
-# Points at which distribution functions are compared.
-NUM_POINTS = 100
 # So many simulations give a covariance with errors of a few per cent.
 MAX_FOR_NOISE = 2000
+# So many rows of distances are computed at a time.
 CHUNK = 500
-NUM_DRAWS = 1000  # of batches of simulations
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,55 +68,3 @@ class Simulations:
         share, basis = torch.linalg.eigh(inverse.T @ self.noise @ inverse)
         left = (1.0 - share).clamp(0.0, 1.0)
         return mean + (points - mean) @ (inverse @ (basis * left) @ basis.T @ root.T)
-
-
-def nearest_distances(points: Tensor, among: Tensor, *, others: bool = False) -> Tensor:
-    """Return the distance from each point to the nearest of others, shape ``(n,)``.
-
-    With ``others`` a point is compared with all but the one in its own row.
-    """
-    nearest = []
-    for rows in torch.arange(len(points)).split(CHUNK):
-        distance = torch.cdist(points[rows], among)
-        if others:
-            distance.scatter_(1, rows[:, None], torch.inf)
-        nearest.append(distance.amin(dim=1))
-    return torch.cat(nearest)
-
-
-def implied_by(
-    coupling: Coupling, points: Tensor, theta: Tensor, *, others: bool = False
-) -> tuple[Tensor, Tensor]:
-    r"""Return the parameters that embeddings ``(n, l)`` imply.
-
-    Point i gives simulation j the weight :math:`\operatorname{softmax}_j(-C_{ij} /
-    \gamma)`. With ``others`` it is not matched with the simulation in its own row.
-
-    Returns:
-        The mean weights of the simulations, ``(n_s,)``, which sum to one; and the
-        distribution functions of each point, ``(n, d, NUM_POINTS)``.
-    """
-    order, last = theta.argsort(dim=0), len(theta) - 1
-    # The ranks at which distribution functions are compared.
-    where = torch.linspace(0, last, min(NUM_POINTS, len(theta))).round().long()
-    total, functions = torch.zeros(len(theta), dtype=torch.float64), []
-    for rows in torch.arange(len(points)).split(CHUNK):
-        weights = coupling.rows(points[rows])
-        if others:
-            weights = weights.scatter(1, rows[:, None], 0.0)
-            weights /= weights.sum(dim=1, keepdim=True).clamp_min(1e-300)
-        total += weights.sum(dim=0)
-        each = [weights[:, column].cumsum(dim=1)[:, where] for column in order.T]
-        functions.append(torch.stack(each, dim=1))
-    return total / len(points), torch.cat(functions)
-
-
-def resampled(values: Tensor, size: int) -> Tensor:
-    """Return means over ``size`` rows drawn with replacement, ``(1000, ...)``."""
-    count = len(values)
-    rows = torch.randint(count, (NUM_DRAWS, size))
-    rows += count * torch.arange(NUM_DRAWS).unsqueeze(1)
-    times = torch.bincount(rows.flatten(), minlength=NUM_DRAWS * count)
-    draws = times.reshape(NUM_DRAWS, count).to(values)
-    mean = draws @ values.reshape(count, -1) / size
-    return mean.reshape(NUM_DRAWS, *values.shape[1:])

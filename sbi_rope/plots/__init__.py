@@ -4,14 +4,12 @@ Every function returns a matplotlib figure and does not show it. matplotlib is i
 when a function is called. Install it with ``pip install sbi-rope[benchmarks]``.
 """
 
-from sbi_rope.plots.diagnosis import implied_parameters
 from sbi_rope.plots.diagnostics import (
     calibration_curves,
     discrepancy,
     effective_sample_sizes,
     finetuning_history,
-    ranks_by_estimate,
-    real_and_simulated,
+    implied_parameters,
 )
 from sbi_rope.plots.posteriors import overview, pair_plot
 from sbi_rope.plots.sets import credible_set
@@ -26,7 +24,5 @@ __all__ = [
     "implied_parameters",
     "overview",
     "pair_plot",
-    "ranks_by_estimate",
-    "real_and_simulated",
     "stacking_report",
 ]
