@@ -19,9 +19,8 @@ from sbi_rope.diagnosis.misspecification import (
     unlike_pairs,
     unmatched,
 )
-from sbi_rope.diagnosis.prior_shift import prior_shift, shifts
+from sbi_rope.diagnosis.prior_shift import cross_fit, prior_shift, shifts
 from sbi_rope.diagnosis.report import Diagnosis, Finding
-from sbi_rope.diagnosis.residuals import cross_fit, residual_finding
 from sbi_rope.diagnosis.simulations import Simulations
 from sbi_rope.metrics.statistics import TwoSampleTest, compare_with_pairs
 from sbi_rope.rope.rope import RoPE
@@ -58,10 +57,8 @@ def diagnose(
     5. Does :math:`g(x_o)` still differ from simulations, after tuning?
     6. Which observations have no simulation near them?
     7. How many simulations are behind each posterior?
-    8. Do the residuals :math:`g(x) - E[h(S(\theta))]` of calibration pairs depend on
-       :math:`\theta`? They are computed on pairs that g was not trained on.
 
-    The last four are about RoPE only. Without calibration pairs g is h, and 1, 5 and 8
+    The last three are about RoPE only. Without calibration pairs g is h, and 1 and 5
     are left out. Each of 1, 3, 4, 5 and 6 raises an alarm by chance in one batch of
     a hundred. The thresholds of 7 are rules of thumb about gamma.
 
@@ -71,10 +68,10 @@ def diagnose(
         x_o: The batch, shape ``(n_o, *event)``.
         num_simulations: n_s, at least 100. If None, ``max(n_o, 1000)``, or all stored
             simulations if there are fewer.
-        num_folds: The number of trainings for 8, each of which takes as long as
-            ``rope.train``. None leaves out 8, and the allowance for errors of g in 3.
+        num_folds: The number of folds of the pairs for the allowance for errors of g in
+            3, each of which takes as long as ``rope.train``. None does without it.
         posterior: The posterior that you use, made with the same pairs. For a stack 5
-            to 8 are left out; 6 takes the place of 2 if x is not standardised. A shift
+            to 7 are left out; 6 takes the place of 2 if x is not standardised. A shift
             of 3 is no alarm if the stack has learned it from the pairs, and 1 shows no
             sign of a difference.
         parameter_names: One name for each parameter. If None, those of ``rope``, or
@@ -117,12 +114,12 @@ def diagnose(
         npe, real, simulated = batch.npe, _moved(batch.real), _moved(batch.simulated)
         simulations = Simulations(_moved(batch.theta), simulated, tuned)
         embedded = npe.embed("x_o", batch.x_o, npe.h)
-        before = mmd_test(_moved(embedded), simulated, null=simulated)
+        before = mmd_test(_moved(embedded), simulated, simulated)
         like_pairs = after = held_out = None
         if tuned:
             of_pairs, groups = npe.embed("x", pairs.x, npe.h), pairs.group.cpu()
             like_pairs = compare_with_pairs(of_pairs, groups, embedded, npe.density())
-            after = mmd_test(real, simulated, null=simulations.averaged)
+            after = mmd_test(real, simulated, simulations.averaged)
         distance = distances(real, simulations)
         if num_folds is not None and pairs.num_groups > 1:
             held_out = cross_fit(rope, num_folds, show=is_shown(show_progress_bars))
@@ -139,7 +136,6 @@ def diagnose(
                 after_tuning(after),
                 near,
                 effective_sizes(batch.couple(rope.coupler), n_s),
-                residual_finding(pairs, held_out, simulations),
             ]
         elif far.value is None:  # a stack, of which a broken observation must be found
             findings.append(near)

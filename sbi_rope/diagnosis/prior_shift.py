@@ -7,10 +7,13 @@ import torch
 from torch import Tensor
 
 from sbi_rope.coupling import Coupling, SinkhornCoupler
+from sbi_rope.data.pairs import group_means, without_warning_of_few_pairs
 from sbi_rope.diagnosis.report import Finding
-from sbi_rope.diagnosis.residuals import HeldOut
 from sbi_rope.diagnosis.simulations import CHUNK, Simulations
 from sbi_rope.metrics.statistics import LEVEL
+from sbi_rope.npe.sbi import embed
+from sbi_rope.rope.rope import RoPE
+from sbi_rope.utils.progress import progress_bar
 from sbi_rope.utils.tensors import divisors
 
 # At tau = 0 each observation is coupled by itself, without trust in the prior. The
@@ -22,6 +25,42 @@ ERROR_QUANTILE = 0.95
 # Points at which distribution functions are compared.
 NUM_POINTS = 100
 NUM_DRAWS = 1000  # of batches of simulations
+
+
+class HeldOut(NamedTuple):
+    r"""Pairs embedded by nets g that were not trained on them, and their targets.
+
+    ``embedded`` is :math:`g(x)`, and ``targets`` :math:`E[h(S(\theta))]`, ``(n_c, l)``.
+    Pairs of one ``group``, ``(n_c,)``, are not independent: their errors are alike.
+    """
+
+    embedded: Tensor
+    targets: Tensor
+    group: Tensor
+
+
+def cross_fit(rope: RoPE, num_folds: int, *, show: bool) -> HeldOut:
+    """Embed each calibration pair by a g that was trained on the other folds."""
+    pairs, count = rope.pairs, rope.finetuner.simulations_per_target
+    targets = rope.draw_targets(count, show_progress_bars=False)
+    embedded = torch.empty_like(targets)
+    # Recordings of one person share a fold, as they do in a stack.
+    folds = pairs.folds(num_folds)
+    for held_out in progress_bar(folds, show=show, desc="Folds"):
+        others = torch.cat([fold for fold in folds if fold is not held_out])
+        with without_warning_of_few_pairs():
+            result = rope.finetuner.finetune(
+                rope.embedding_net,
+                pairs.x[others],
+                lambda count, others=others: targets[others],
+                draw_simulations=lambda n: rope.source.from_prior(n, seed=0)[1],
+                groups=pairs.group[others],
+                weights=pairs.weight[others],
+                show_progress_bars=False,
+            )
+        embedded[held_out] = embed(result.embedding_net, pairs.x[held_out])
+    moved = (values.cpu().double() for values in (embedded, targets))
+    return HeldOut(*moved, group=pairs.group.cpu())
 
 
 class PriorShift(NamedTuple):
@@ -76,7 +115,8 @@ def prior_shift(
         _, found = _implied_by(coupling, held_out.embedded, theta)
         _, wanted = _implied_by(coupling, targets, theta)
         # With few groups the errors could be small by chance, hence a bootstrap.
-        difference = held_out.mean_of_groups(found - wanted)
+        one_each = torch.ones(len(found))
+        difference, _ = group_means(found - wanted, one_each, held_out.group)
         largest = _resampled(difference, len(difference)).abs().amax(dim=-1)
         threshold = threshold + largest.quantile(ERROR_QUANTILE, dim=0)
     distance = (functions.mean(dim=0) - expected.mean(dim=0)).abs().amax(dim=-1)

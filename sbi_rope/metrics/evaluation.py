@@ -28,7 +28,7 @@ from sbi_rope.npe.prior import PriorDistribution
 from sbi_rope.utils.errors import InvalidInputError
 from sbi_rope.utils.progress import progress_bar
 from sbi_rope.utils.seeds import seeded
-from sbi_rope.utils.settings import Count, Positive, Range, check, default_names
+from sbi_rope.utils.settings import Positive, Range, check, default_names
 from sbi_rope.utils.tensors import as_batch, rows_with
 
 # The level of the intervals whose coverage is stated.
@@ -43,6 +43,8 @@ NOMINAL = torch.arange(1, 100, dtype=torch.double) / 100
 # Levels are ratios of integers. Those that are equal before rounding must be after it.
 ROUNDING = 1e-9
 ACAUC_IN_WORDS = "0 is calibrated, positive is over-confident, negative is too wide"
+# How many observations a posterior is called with at a time.
+CHUNK_SIZE = 100
 # By a single draw all posteriors look calibrated whose draws are too large as often as
 # too small.
 NumSamples = Annotated[int, Range(20, MAX_SAMPLES)]
@@ -343,7 +345,6 @@ def evaluate(
     theta_std: Tensor | None = None,
     num_samples: int = 1000,
     seed: int | None = None,
-    chunk_size: int = 100,
     show_progress_bars: bool = False,
 ) -> Evaluation:
     r"""Score a posterior by the density of the true parameters and by calibration.
@@ -361,8 +362,7 @@ def evaluate(
             the standard deviations of the posterior's prior.
         num_samples: The number of posterior samples for each observation, 20 or more.
             A fifth of them is for the estimates, the others are for the ranks.
-        seed: The seed of the samples, which also depend on ``chunk_size``.
-        chunk_size: How many observations are scored at a time.
+        seed: The seed of the samples.
         show_progress_bars: Whether to show progress.
 
     Returns:
@@ -381,11 +381,10 @@ def evaluate(
         >>> found.lpp.mean
         0.0
     """
-    check("chunk_size", chunk_size, Count)
     check("num_samples", num_samples, NumSamples)
     theta = read_theta(posterior, theta)
     x = read_x(posterior, x, rows=len(theta))
-    chunks = [*zip(theta.split(chunk_size), x.split(chunk_size), strict=True)]
+    chunks = [*zip(theta.split(CHUNK_SIZE), x.split(CHUNK_SIZE), strict=True)]
 
     def bar(text: str) -> Iterable[tuple[Tensor, Tensor]]:
         return progress_bar(chunks, show=show_progress_bars, desc=text)
@@ -467,4 +466,4 @@ def _p_value(ranks: Tensor, estimates: Tensor) -> float:
     outcomes = torch.stack([ranks, (2 * ranks - 1).abs()], dim=1)
     features = torch.stack([place, place.square()], dim=1)
     with seeded(0):
-        return permutation_test(outcomes, features)[0]
+        return permutation_test(outcomes, features)

@@ -106,17 +106,12 @@ class Estimate:
 # Whether numbers depend on others -----------------------------------------------------
 
 
-def permutation_test(outcomes: Tensor, features: Tensor) -> tuple[float, float, int]:
-    """Test whether rows of outcomes depend linearly on rows of features.
+def permutation_test(outcomes: Tensor, features: Tensor) -> float:
+    """Return the p-value of a linear dependence of outcomes on features.
 
     The statistic is the sum of squares that a linear regression with an intercept
     explains. If the rows of the outcomes ``(n, l)`` are exchangeable given the features
     ``(n, p)``, the p-value is below any level at most as often as the level says.
-
-    Returns:
-        The share of permutations that explain as much, the data themselves included;
-        the sum of squares that is explained; and the number of features that are
-        linearly independent.
     """
     features = features - features.mean(dim=0)
     vectors, values, _ = torch.linalg.svd(features, full_matrices=False)
@@ -129,7 +124,7 @@ def permutation_test(outcomes: Tensor, features: Tensor) -> tuple[float, float, 
         permuted.append((basis.T @ centred[rows]).square().sum(dim=(1, 2)))
     # A permutation that is equal up to rounding counts.
     reached = int((torch.cat(permuted) >= explained * (1 - 1e-12)).sum())
-    return (1 + reached) / (1 + NUM_PERMUTATIONS), explained, basis.shape[1]
+    return (1 + reached) / (1 + NUM_PERMUTATIONS)
 
 
 # Whether two sets come from one distribution ------------------------------------------
