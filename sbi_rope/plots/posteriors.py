@@ -10,15 +10,13 @@ from torch import Tensor
 from sbi_rope.plots._figures import BLUE, VERMILLION, empty_figure, hide_frame
 from sbi_rope.plots._samples import (
     as_drawn,
-    as_samples,
+    as_posteriors,
     central_interval,
     corner_legend,
     corner_panels,
     draw_contours,
     draw_posteriors,
-    limits_of,
     set_up_panel,
-    styled,
     with_margin,
 )
 
@@ -56,14 +54,12 @@ def pair_plot(
     Returns:
         The figure, with d rows and columns and the marginals on the diagonal.
     """
-    draws, truth, names = as_samples(samples, theta, parameter_names)
-    interval = _interval(prior, len(names))
-    limits = limits_of(draws.values(), truth, interval)
-    figure = empty_figure(2.0 * len(names) + 0.8, 2.0 * len(names) + 1.0)
-    posteriors = styled(draws, limits)
-    for axes, shown in corner_panels(figure, names, limits, truth):
-        draw_posteriors(axes, posteriors, interval, shown)
-    corner_legend(figure, figure.axes[0].get_legend_handles_labels()[0], None)
+    posteriors = as_posteriors(samples, theta, parameter_names, prior)
+    names, limits, truth = posteriors.names, posteriors.limits, posteriors.truth
+    figure, panels = corner_panels(names, limits, truth)
+    for axes, shown in panels:
+        draw_posteriors(axes, posteriors, shown)
+    corner_legend(figure, panels[0][0].get_legend_handles_labels()[0])
     return figure
 
 
@@ -112,9 +108,7 @@ def overview(
         as_drawn("after", after, width),
     )
     weights = as_drawn("weights", weights, (), rows=len(simulated))
-    draws, truth, names = as_samples(samples, theta, parameter_names)
-    interval = _interval(prior, len(names))
-    limits = limits_of(draws.values(), truth, interval)
+    posteriors = as_posteriors(samples, theta, parameter_names, prior)
     figure = empty_figure(9.6, 3.9)
     tune, couple, mix = figure.subplots(1, 3)
 
@@ -143,9 +137,10 @@ def overview(
     label = f"its {count:.0f} or so simulations"
     couple.plot([], [], "o", color=BLUE, mew=0, label=label)
 
+    names, limits, truth = posteriors.names, posteriors.limits, posteriors.truth
     shown = list(range(len(names)))[:2]
     set_up_panel(mix, names, limits, truth, shown)
-    draw_posteriors(mix, styled(draws, limits), interval, shown)
+    draw_posteriors(mix, posteriors, shown)
     # The legends are below the panels, because points can be in any corner inside.
     style = {"frameon": False, "loc": "upper center"}
     tune.legend(**style, bbox_to_anchor=(0.5, -0.08), markerscale=2)
@@ -155,10 +150,6 @@ def overview(
     couple.set_title("2.  Couple: weigh simulations\n     for each", **TITLE)
     mix.set_title("3.  Mix: average\n     their posteriors", **TITLE)
     return figure
-
-
-def _interval(prior: Tensor | None, dim: int) -> Tensor | None:
-    return None if prior is None else central_interval(as_drawn("prior", prior, (dim,)))
 
 
 def _in_plane(simulated: Tensor, *others: Tensor) -> list[Tensor]:

@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from sbi_rope.density import MixturePosterior
-from sbi_rope.plots._figures import BLUE, GREY, ORANGE, empty_figure
+from sbi_rope.plots._figures import BLUE, GREY, ORANGE
 from sbi_rope.plots._samples import (
+    TRUTH,
     as_samples,
     central_interval,
     corner_legend,
@@ -72,8 +73,8 @@ def credible_set(
     shown += [] if truth is None else [truth[None]]
     shown = torch.cat([one.to(draws) for one in shown]).nan_to_num(posinf=0, neginf=0)
     limits = with_margin(shown.amin(dim=0), shown.amax(dim=0))
-    figure = empty_figure(2.0 * len(labels) + 0.8, 2.0 * len(labels) + 1.0)
-    for axes, pair in corner_panels(figure, labels, limits, truth):
+    figure, panels = corner_panels(labels, limits, truth)
+    for axes, pair in panels:
         if len(pair) == 1:
             draw_marginal(axes, draws[:, pair[0]], {"color": GREY})
             for name, end in ends.items():
@@ -85,7 +86,7 @@ def credible_set(
             axes.scatter(*columns, s=5, color=colour, lw=0, rasterized=True)
     from matplotlib.lines import Line2D
 
-    of = f"{100 * level:.4g} %"
-    handles = [Line2D([], [], label=f"{of}, {k}", **STYLES[k]) for k in found]
-    corner_legend(figure, handles, truth)
+    styles = {f"{100 * level:.4g} %, {name}": STYLES[name] for name in found}
+    styles |= {} if truth is None else {"truth": TRUTH}
+    corner_legend(figure, [Line2D([], [], label=k, **v) for k, v in styles.items()])
     return figure
