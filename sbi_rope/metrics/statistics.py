@@ -1,4 +1,4 @@
-"""Weighted means over calibration pairs with their errors, and permutation tests."""
+"""Weighted means over calibration pairs with their errors, and a test of two sets."""
 
 import math
 from collections.abc import Sequence
@@ -13,9 +13,6 @@ from sbi_rope.data.pairs import effective_number, group_means, one_of_each_group
 from sbi_rope.utils.seeds import seeded
 from sbi_rope.utils.tensors import divisors
 
-NUM_PERMUTATIONS = 1000
-# So many are made at a time, which takes memory for as many copies of the outcomes.
-AT_A_TIME = 100
 # Two sets differ clearly if the p-value is below this.
 LEVEL = 0.01
 NUM_DIVISIONS = 999
@@ -101,30 +98,6 @@ class Estimate:
 
     def __str__(self) -> str:
         return format(self, ".3g")
-
-
-# Whether numbers depend on others -----------------------------------------------------
-
-
-def permutation_test(outcomes: Tensor, features: Tensor) -> float:
-    """Return the p-value of a linear dependence of outcomes on features.
-
-    The statistic is the sum of squares that a linear regression with an intercept
-    explains. If the rows of the outcomes ``(n, l)`` are exchangeable given the features
-    ``(n, p)``, the p-value is below any level at most as often as the level says.
-    """
-    features = features - features.mean(dim=0)
-    vectors, values, _ = torch.linalg.svd(features, full_matrices=False)
-    basis = vectors[:, values > 1e-9 * values.max()]
-    centred = outcomes - outcomes.mean(dim=0)
-    explained = float((basis.T @ centred).square().sum())
-    permuted = []
-    for _ in range(NUM_PERMUTATIONS // AT_A_TIME):
-        rows = torch.stack([torch.randperm(len(centred)) for _ in range(AT_A_TIME)])
-        permuted.append((basis.T @ centred[rows]).square().sum(dim=(1, 2)))
-    # A permutation that is equal up to rounding counts.
-    reached = int((torch.cat(permuted) >= explained * (1 - 1e-12)).sum())
-    return (1 + reached) / (1 + NUM_PERMUTATIONS)
 
 
 # Whether two sets come from one distribution ------------------------------------------
