@@ -19,9 +19,8 @@ from sbi_rope.diagnosis.misspecification import (
     unlike_pairs,
     unmatched,
 )
-from sbi_rope.diagnosis.prior_shift import cross_fit, prior_shift, shifts
+from sbi_rope.diagnosis.prior_shift import Simulations, cross_fit, prior_shift, shifts
 from sbi_rope.diagnosis.report import Diagnosis, Finding
-from sbi_rope.diagnosis.simulations import Simulations
 from sbi_rope.metrics.statistics import TwoSampleTest, compare_with_pairs
 from sbi_rope.rope.rope import RoPE
 from sbi_rope.utils.errors import InvalidInputError
@@ -120,7 +119,7 @@ def diagnose(
             of_pairs, groups = npe.embed("x", pairs.x, npe.h), pairs.group.cpu()
             like_pairs = compare_with_pairs(of_pairs, groups, embedded, npe.density())
             after = mmd_test(real, simulated, simulations.averaged)
-        distance = distances(real, simulations)
+        distance = distances(real, simulated, simulations.averaged)
         if num_folds is not None and pairs.num_groups > 1:
             held_out = cross_fit(rope, num_folds, show=is_shown(show_progress_bars))
         shift = prior_shift(real, simulations, held_out)

@@ -8,13 +8,13 @@ from torch import Tensor, nn
 
 from sbi_rope.coupling import Coupling
 from sbi_rope.diagnosis.report import Finding
-from sbi_rope.diagnosis.simulations import CHUNK, Simulations
 from sbi_rope.metrics.statistics import LEVEL, TwoSampleTest
 from sbi_rope.npe.standardisation import FAR, deviations
 
 # The most observations and simulations in one MMD, whose cost is quadratic.
 MAX_OBSERVATIONS, MAX_SIMULATIONS = 200, 400
 NUM_DRAWS = 200
+CHUNK = 500  # rows of distances that are computed at a time
 # An observation is flagged if its nearest simulation is farther away than the nearest
 # neighbours of all simulations but this share.
 FLAGGED_SHARE = 0.001
@@ -75,39 +75,22 @@ def before_tuning(test: tuple[float, float], *, tuned: bool) -> Finding:
             "Either the simulator is wrong or the batch has other parameters than the "
             "prior. Append calibration pairs, which repair the first."
         )
-    return _of_mmd("before", "NPE", test, advice, is_alarm=not tuned)
+    text = f"{_unlike('NPE', *test)} {advice}"
+    name = "misspecification before tuning"
+    return _by_p_value(name, test[1], text, is_alarm=not tuned)
 
 
 def after_tuning(test: tuple[float, float] | None) -> Finding:
     """Say whether tuning has moved the batch among the simulations."""
+    name = "misspecification after tuning"
     if test is None:
-        why = "there are no calibration pairs"
-        return Finding("misspecification after tuning", f"Not tested, because {why}.")
+        return Finding(name, "Not tested, because there are no calibration pairs.")
     advice = (
         "Append more calibration pairs like the batch, or lower tau if the batch is "
         "narrower than the prior or shifted."
     )
-    return _of_mmd("after", "RoPE's tuned embedding net", test, advice)
-
-
-def _of_mmd(
-    when: str,
-    net: str,
-    test: tuple[float, float],
-    advice: str,
-    *,
-    is_alarm: bool = True,
-) -> Finding:
-    ratio, p_value = test
-    sentence = f"No sign of it (p = {p_value:.2g})."
-    if p_value < LEVEL:
-        sentence = (
-            f"{net} sees the batch as unlike simulations: its squared MMD is "
-            f"{ratio:.{0 if ratio >= 10 else 1}f} times that of a batch of simulations "
-            f"(p = {p_value:.2g}). {advice}"
-        )
-    name, alarming = f"misspecification {when} tuning", p_value < LEVEL and is_alarm
-    return Finding(name, sentence, alarming, p_value, LEVEL)
+    text = _unlike("RoPE's tuned embedding net", *test)
+    return _by_p_value(name, test[1], f"{text} {advice}")
 
 
 def unlike_pairs(test: TwoSampleTest | None, names: Sequence[str]) -> Finding:
@@ -116,17 +99,31 @@ def unlike_pairs(test: TwoSampleTest | None, names: Sequence[str]) -> Finding:
     if test is None:
         few = "five observations and five pairs with different labels (or groups)"
         return Finding(name, f"Not tested, because this needs {few}.")
-    sentence = f"No sign of it (p = {test.p_value:.2g})."
-    if test.is_different:
-        found = ", ".join(test.parameters(names))
-        where = f", and its parameters differ in {found}" if found else ""
-        sentence = (
-            f"NPE sees the batch as unlike the pairs (p = {test.p_value:.2g}): its "
-            f"observations are {test.spread:.2f} times as far apart{where}. Label some "
-            "observations like those of the batch. Weights, scores, calibration and "
-            "guarantees that were found on the pairs need not hold here."
-        )
-    return Finding(name, sentence, test.is_different, test.p_value, LEVEL)
+    found = ", ".join(test.parameters(names))
+    where = f", and its parameters differ in {found}" if found else ""
+    text = (
+        f"NPE sees the batch as unlike the pairs (p = {test.p_value:.2g}): its "
+        f"observations are {test.spread:.2f} times as far apart{where}. Label some "
+        "observations like those of the batch. Weights, scores, calibration and "
+        "guarantees that were found on the pairs need not hold here."
+    )
+    return _by_p_value(name, test.p_value, text)
+
+
+def _unlike(net: str, ratio: float, p_value: float) -> str:
+    return (
+        f"{net} sees the batch as unlike simulations: its squared MMD is "
+        f"{ratio:.{0 if ratio >= 10 else 1}f} times that of a batch of simulations "
+        f"(p = {p_value:.2g})."
+    )
+
+
+def _by_p_value(
+    name: str, p_value: float, text: str, *, is_alarm: bool = True
+) -> Finding:
+    is_unlike = p_value < LEVEL
+    sentence = text if is_unlike else f"No sign of it (p = {p_value:.2g})."
+    return Finding(name, sentence, is_unlike and is_alarm, p_value, LEVEL)
 
 
 def far_entries(embedding_net: nn.Module, x_o: Tensor) -> Finding:
@@ -147,22 +144,21 @@ def far_entries(embedding_net: nn.Module, x_o: Tensor) -> Finding:
     return Finding(name, sentence, value > FAR, value, FAR)
 
 
-def distances(real: Tensor, simulations: Simulations) -> Tensor:
+def distances(real: Tensor, simulated: Tensor, averaged: Tensor) -> Tensor:
     """Return how far ``real`` is from the nearest simulation, where 1 is the limit.
 
     One or two in a thousand simulations exceed the limit if they take the place of
     observations. A tuned g averages over the simulator's noise, and may put
     observations between simulations, such as between the categories of an entry. The
-    limit allows for that.
+    limit allows for that, by the ``averaged`` simulations.
     """
-    embedded = simulations.embedded
     # A new value exceeds the (k+1)-th largest of n with probability (k + 1) / (n + 1).
-    k = int(FLAGGED_SHARE * len(embedded))
+    k = int(FLAGGED_SHARE * len(simulated))
     limit = max(
-        float(_nearest(ends, embedded, others=True).sort().values[-1 - k])
-        for ends in (embedded, simulations.averaged)
+        float(_nearest(ends, simulated, others=True).sort().values[-1 - k])
+        for ends in (simulated, averaged)
     )
-    return _nearest(real, embedded) / max(limit, torch.finfo(torch.float64).tiny)
+    return _nearest(real, simulated) / max(limit, torch.finfo(torch.float64).tiny)
 
 
 def _nearest(points: Tensor, among: Tensor, *, others: bool = False) -> Tensor:
@@ -217,7 +213,5 @@ def effective_sizes(coupling: Coupling, num_simulations: int) -> Finding:
             " This is almost the prior. Lower gamma, or, for a single observation, use "
             "`stack(rope)`, which needs no batch."
         )
-    if not coupling.converged:
-        sentence += " The coupling has not converged, so that this is approximate."
     name, alarming = "simulations behind each posterior", value > threshold
     return Finding(name, sentence, alarming, value, threshold)

@@ -1,6 +1,8 @@
 """Compare the parameters that the batch implies with the prior."""
 
 from collections.abc import Container, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -9,7 +11,6 @@ from torch import Tensor
 from sbi_rope.coupling import Coupling, SinkhornCoupler
 from sbi_rope.data.pairs import group_means, without_warning_of_few_pairs
 from sbi_rope.diagnosis.report import Finding
-from sbi_rope.diagnosis.simulations import CHUNK, Simulations
 from sbi_rope.metrics.statistics import LEVEL
 from sbi_rope.npe.sbi import embed
 from sbi_rope.rope.rope import RoPE
@@ -25,6 +26,65 @@ ERROR_QUANTILE = 0.95
 # Points at which distribution functions are compared.
 NUM_POINTS = 100
 NUM_DRAWS = 1000  # of batches of simulations
+# So many simulations give a covariance with errors of a few per cent.
+MAX_FOR_NOISE = 2000
+CHUNK = 500  # points whose weights are computed at a time
+
+
+@dataclass(frozen=True, eq=False)
+class Simulations:
+    r"""Simulations from the prior, in float64 on the CPU.
+
+    Attributes:
+        theta: Their parameters, ``(n_s, d)``.
+        embedded: :math:`h(x_s)`, ``(n_s, l)``.
+        tuned: Whether g was tuned, so that it may average over the simulator's noise.
+    """
+
+    theta: Tensor
+    embedded: Tensor
+    tuned: bool
+
+    @cached_property
+    def noise(self) -> Tensor:
+        r"""Covariance :math:`W` of :math:`h(x_s)` given theta, ``(l, l)``.
+
+        It is estimated from differences between simulations with neighbouring
+        parameters, without a quadratic trend. With many parameters and few simulations,
+        neighbours are far apart and the estimate is too large.
+        """
+        theta, embedded = self.theta[:MAX_FOR_NOISE], self.embedded[:MAX_FOR_NOISE]
+        standard = (theta - theta.mean(dim=0)) / divisors(theta.std(dim=0))
+        ones = torch.ones_like(standard[:, :1])
+        features = torch.cat([ones, standard, standard.square()], dim=1)
+        residual = embedded - features @ (torch.linalg.pinv(features) @ embedded)
+        distance = torch.cdist(standard, standard).fill_diagonal_(torch.inf)
+        difference = residual - residual[distance.argmin(dim=1)]
+        return difference.T @ difference / (2 * len(difference))
+
+    @cached_property
+    def averaged(self) -> Tensor:
+        """Embeddings of the simulations as a tuned g would have them, ``(n_s, l)``."""
+        return self.average(self.embedded)
+
+    def average(self, points: Tensor) -> Tensor:
+        r"""Move embeddings ``(n, l)`` as tuning does if nothing is wrong.
+
+        Tuning moves :math:`g(x)` towards :math:`E[h \mid \theta]`. It can reach at best
+        the mean of this given x, to first order :math:`\mu + (I - W V^{-1})(h - \mu)`,
+        with V the covariance of h. Without tuning, h is not changed.
+        """
+        if not self.tuned:
+            return points
+        mean = self.embedded.mean(dim=0)
+        centred = self.embedded - mean
+        values, vectors = torch.linalg.eigh(centred.T @ centred / len(centred))
+        kept = values > 1e-10 * values.max()
+        root = vectors[:, kept] * values[kept].sqrt()
+        inverse = vectors[:, kept] / values[kept].sqrt()
+        share, basis = torch.linalg.eigh(inverse.T @ self.noise @ inverse)
+        left = (1.0 - share).clamp(0.0, 1.0)
+        return mean + (points - mean) @ (inverse @ (basis * left) @ basis.T @ root.T)
 
 
 class HeldOut(NamedTuple):

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from sbi_rope.density import Density, MixturePosterior, PriorPosterior
 from sbi_rope.npe.sbi import NeuralPosterior, is_bounded, readable
-from sbi_rope.utils.errors import InvalidInputError, LogProbUnavailableError
+from sbi_rope.utils.errors import InvalidInputError
 from sbi_rope.utils.settings import Range, check
 from sbi_rope.utils.tensors import as_batch, as_numbers, rows_with
 
@@ -84,11 +84,6 @@ def samples_of(
 
 def log_probs_of(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
     """Return the log density of each true parameter, float64, shape ``(n,)``."""
-    if not hasattr(posterior, "log_prob_batched"):
-        raise LogProbUnavailableError(
-            "Expected `posterior` with a method `log_prob_batched`; got "
-            f"{type(posterior).__name__}."
-        )
     is_direct = isinstance(posterior, DirectPosterior) and not is_bounded(posterior)
     arguments = {"norm_posterior": False} if is_direct else {}
     with torch.no_grad():

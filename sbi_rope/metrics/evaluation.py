@@ -363,7 +363,6 @@ def evaluate(
     Raises:
         InvalidInputError: If an argument has the wrong shape or is not finite, or the
             posterior returns NaN.
-        LogProbUnavailableError: If the posterior has no ``log_prob_batched``.
 
     Example:
         >>> from sbi.utils import BoxUniform

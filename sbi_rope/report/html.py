@@ -13,14 +13,10 @@ from sbi_rope.diagnosis import Diagnosis
 from sbi_rope.plots import discrepancy, implied_parameters, stacking_report
 from sbi_rope.stacking import StackingReport
 from sbi_rope.stacking.sections import METHODS, headline, sections_of
-from sbi_rope.utils.errors import InvalidInputError
 from sbi_rope.utils.settings import check, names_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-# A page of this package is recognised by this.
-GENERATOR = b'<meta name="generator" content="sbi_rope'
 
 
 @dataclass
@@ -49,8 +45,7 @@ def write_html(
 
     Args:
         report: The ``report`` of the posterior that :func:`sbi_rope.stack` returned.
-        path: The file. Its folder is made if there is none. A report of this package
-            that is there already is replaced, and no other file.
+        path: The file, which is replaced. Its folder is made if there is none.
         diagnosis: What :func:`sbi_rope.diagnose` says about a batch, if the report
             should hold it.
         parameter_names: A name for each parameter. If None, those that ``RoPE`` was
@@ -58,18 +53,10 @@ def write_html(
         x_names: A name for each entry of x; "x[0]" and so on if None.
 
     Raises:
-        InvalidInputError: If the names do not fit, or the path is a folder or a file of
-            something else.
+        InvalidInputError: If the names do not fit.
     """
     check("report", report, StackingReport)
     check("diagnosis", diagnosis, Diagnosis | None)
-    path = Path(path).expanduser()
-    is_file = path.is_file()
-    if path.exists() and not (is_file and GENERATOR in path.read_bytes()[:1000]):
-        raise InvalidInputError(
-            "Expected `path` to be a new file or an earlier report, which is replaced; "
-            f"got {path}."
-        )
     if parameter_names is not None:
         names = names_of(parameter_names, len(report.held_out.names))
         held_out = replace(report.held_out, parameter_names=names)
@@ -98,8 +85,9 @@ def write_html(
         headline=headline(report),
         sections=parts,
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8")
+    file = Path(path).expanduser()
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(text, encoding="utf-8")
 
 
 def _parts(report: StackingReport) -> Iterator[_Part]:

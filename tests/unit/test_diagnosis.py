@@ -13,8 +13,12 @@ from torch import Tensor, nn
 from sbi_rope import CalibrationFinetuner, RoPE, SinkhornCoupler
 from sbi_rope.diagnosis import Diagnosis, diagnose
 from sbi_rope.diagnosis.misspecification import distances, mmd_test, unmatched
-from sbi_rope.diagnosis.prior_shift import HeldOut, cross_fit, prior_shift
-from sbi_rope.diagnosis.simulations import Simulations
+from sbi_rope.diagnosis.prior_shift import (
+    HeldOut,
+    Simulations,
+    cross_fit,
+    prior_shift,
+)
 from sbi_rope.metrics.statistics import compare_with_pairs
 from sbi_rope.plots import implied_parameters
 from tests import gaussian
@@ -212,7 +216,9 @@ def test_distances_to_simulations_agree_with_brute_force() -> None:
     every = torch.cdist(known.embedded, known.embedded)
     limit = every.fill_diagonal_(torch.inf).amin(dim=1).max()
     nearest = (real[:, None] - known.embedded[None]).norm(dim=2).amin(dim=1)
-    assert torch.allclose(distances(real, known), nearest / limit, rtol=1e-6)
+    assert torch.allclose(
+        distances(real, known.embedded, known.averaged), nearest / limit, rtol=1e-6
+    )
 
 
 def test_simulations_are_flagged_as_often_as_stated() -> None:
@@ -220,7 +226,11 @@ def test_simulations_are_flagged_as_often_as_stated() -> None:
     counts = 0
     for _ in range(20):
         known = simulations(1000)
-        counts += int((distances(simulations(500).embedded, known) > 1).sum())
+        counts += int(
+            (
+                distances(simulations(500).embedded, known.embedded, known.averaged) > 1
+            ).sum()
+        )
     # 20 expected; flags of one set of simulations come together.
     assert 5 <= counts <= 45
     # Of 500 observations, one batch in a hundred has more than four.
@@ -242,8 +252,8 @@ def test_categories_of_a_right_simulator_have_simulations_near_them() -> None:
     known = Simulations(theta[:1000], embedded[:1000], tuned=True)
     real = known.average(embedded[1000:])
     # Averaging over noise moves observations between the categories.
-    assert (distances(real, replace(known, tuned=False)) > 1).double().mean() > 0.9
-    assert not unmatched(distances(real, known), 1000).alarming
+    assert (distances(real, known.embedded, known.embedded) > 1).double().mean() > 0.9
+    assert not unmatched(distances(real, known.embedded, known.averaged), 1000).alarming
 
 
 @pytest.mark.medium

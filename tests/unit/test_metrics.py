@@ -19,7 +19,7 @@ from torch.distributions import Normal
 from sbi_rope import metrics
 from sbi_rope.metrics import Estimate, Evaluation
 from sbi_rope.metrics.evaluation import NOMINAL, estimates_and_ranks, verdict_of
-from sbi_rope.utils.errors import InvalidInputError, LogProbUnavailableError
+from sbi_rope.utils.errors import InvalidInputError
 from tests import gaussian
 from tests.refusals import assert_refused
 
@@ -485,14 +485,6 @@ def test_an_evaluation_says_what_is_wrong_with_parameters_and_their_units() -> N
     good: dict[str, Any] = {"theta": theta, "x": x, "num_samples": 20}
     for change, match in cases:
         assert_refused(match, metrics.evaluate, GaussianPosterior(), **good | change)
-
-
-def test_a_posterior_without_density_is_refused() -> None:
-    class NoDensity(GaussianPosterior):
-        log_prob_batched = property()  # type: ignore[assignment]
-
-    with pytest.raises(LogProbUnavailableError, match="NoDensity"):
-        metrics.evaluate(NoDensity(), *gaussian_pairs(30))
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
