@@ -7,19 +7,16 @@ when a function is called. Install it with ``pip install sbi-rope[benchmarks]``.
 from sbi_rope.plots.diagnostics import (
     calibration_curves,
     discrepancy,
-    effective_sample_sizes,
     finetuning_history,
     implied_parameters,
 )
-from sbi_rope.plots.posteriors import overview, pair_plot
-from sbi_rope.plots.sets import credible_set
+from sbi_rope.plots.posteriors import credible_set, overview, pair_plot
 from sbi_rope.plots.stacking import stacking_report
 
 __all__ = [
     "calibration_curves",
     "credible_set",
     "discrepancy",
-    "effective_sample_sizes",
     "finetuning_history",
     "implied_parameters",
     "overview",

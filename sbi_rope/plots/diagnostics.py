@@ -1,4 +1,4 @@
-"""Pictures of discrepancies, calibration, diagnoses, fine-tuning and couplings."""
+"""Pictures of discrepancies, calibration, diagnoses and fine-tuning."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from sbi_rope.coupling import Coupling
 from sbi_rope.diagnosis import Diagnosis
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.metrics import Evaluation
@@ -14,7 +13,6 @@ from sbi_rope.metrics.evaluation import NOMINAL
 from sbi_rope.plots._figures import (
     BLUE,
     GREY,
-    SKY,
     VERMILLION,
     add_legend_above,
     draw_calibrated_band,
@@ -188,32 +186,4 @@ def finetuning_history(history: History) -> "Figure":
     axes.locator_params("x", integer=True)
     axes.set_ylabel("mean distance to the target\n(units of the embedding)")
     axes.legend(frameon=False)
-    return figure
-
-
-def effective_sample_sizes(coupling: Coupling) -> "Figure":
-    r"""Draw how many simulations contribute to the posterior of each observation.
-
-    The effective sample size of observation :math:`i` is
-    :math:`1 / \sum_j \alpha_{ij}^2`. It is 1 if a single simulation has all the weight,
-    and the number of simulations :math:`n_s` if all have the same weight. A line marks
-    :math:`n_s`.
-
-    Args:
-        coupling: A coupling of observations to simulations, ``posterior.coupling``.
-
-    Returns:
-        The figure, a histogram on a logarithmic axis.
-    """
-    sizes = coupling.effective_sample_size.detach().cpu().double()
-    n_s, median = len(coupling.simulated), float(sizes.median())
-    figure, axes = new_figure(6.0, 3.6)
-    edges = np.geomspace(1, max(n_s, 2), 41).tolist()
-    axes.hist(sizes.clamp(edges[0], edges[-1]), bins=edges, color=SKY)
-    axes.axvline(median, color=BLUE, lw=1.8, label=f"median: {median:.3g} simulations")
-    label = f"all equal: $n_s$ = {n_s}"
-    axes.axvline(n_s, color="black", ls="--", lw=1.2, label=label)
-    axes.set(xscale="log", xlabel="effective sample size (simulations)")
-    axes.set_ylabel(f"observations (of {len(sizes)})")
-    axes.legend(frameon=False, loc="upper left")
     return figure

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sbi_rope import SinkhornCoupler, plots
+from sbi_rope import plots
 from sbi_rope.discrepancy import DiscrepancyReport, Interval, SummaryDiscrepancy
 from sbi_rope.metrics import Evaluation
 from sbi_rope.rope.finetuning import History
@@ -135,7 +135,7 @@ def test_the_area_of_a_histogram_is_one_whatever_extreme_samples_are() -> None:
     assert edges[-1] < 5.0
 
 
-# Calibration, fine-tuning, couplings -------------------------------------------------
+# Calibration, fine-tuning -------------------------------------------------
 
 
 def evaluation(ranks: Tensor) -> Evaluation:
@@ -173,17 +173,6 @@ def test_finetuning_history_marks_the_kept_step() -> None:
     axes = plots.finetuning_history(without_held_out).axes[0]
     texts = legend_texts(axes.get_legend())
     assert texts == ["training pairs", "kept: step 0 (the starting point)"]
-
-
-@pytest.mark.parametrize("num_simulations", [1, 50])
-def test_effective_sample_sizes_count_every_observation(num_simulations: int) -> None:
-    simulated = torch.randn(num_simulations, 2)
-    real = torch.cat([torch.randn(29, 2), 100 * simulated[:1]])
-    coupler = SinkhornCoupler(gamma=1.0, tau=0.0, cost_scale="none")
-    axes = plots.effective_sample_sizes(coupler.couple(real, simulated)).axes[0]
-    assert sum(bar.get_height() for bar in axes.patches) == 30
-    assert axes.lines[1].get_xdata()[0] == num_simulations
-    assert f"{num_simulations}" in legend_texts(axes.get_legend())[1]
 
 
 # The three steps ---------------------------------------------------------------------
