@@ -90,9 +90,8 @@ def test_nothing_alarms_where_the_simulator_is_right() -> None:
         "entries far from simulations",
         "misspecification after tuning",
     }
-    assert "200 observations against 1000 simulations: no alarm in 5 tests" in flat(
-        diagnosis
-    )
+    text = "200 observations against 1000 simulations: no alarm in 5 tests"
+    assert text in flat(diagnosis)
 
 
 @pytest.mark.medium
@@ -136,9 +135,8 @@ def test_alarms_come_first_and_say_what_to_do() -> None:
     assert is_alarm == sorted(is_alarm, reverse=True)
     assert 1 < sum(is_alarm) < len(is_alarm)
     for one in loud.findings:
-        assert f"{'!' if one.alarming else '-'} {one.name}: {one.sentence}" in flat(
-            loud
-        )
+        sign = "!" if one.alarming else "-"
+        assert f"{sign} {one.name}: {one.sentence}" in flat(loud)
     assert max(map(len, str(loud).splitlines())) <= 88
 
 
@@ -184,20 +182,6 @@ def test_p_values_of_the_mmd_test_are_uniform_for_simulations() -> None:
     assert kstest(values, "uniform").pvalue > 0.01
 
 
-@pytest.mark.slow
-def test_averaging_over_noise_is_not_taken_for_misspecification() -> None:
-    torch.manual_seed(12)
-    # With so much noise an observation explains a third of a parameter's variance.
-    share, std = 1 / 3, 2.0**0.5
-    theta, theta_o = parameters(1000).double(), parameters(300).double()
-    embedded = share * (theta + std * torch.randn_like(theta))
-    known = Simulations(theta, embedded, tuned=True)
-    # What the best g gives: the posterior mean of the target.
-    best = share**2 * (theta_o + std * torch.randn_like(theta_o))
-    assert mmd_test(best, known.embedded, known.averaged)[1] > 0.01
-    assert mmd_test(best, known.embedded, known.embedded)[1] < 0.01
-
-
 def test_noise_and_averaged_embeddings_are_those_of_the_gaussian_problem() -> None:
     torch.manual_seed(13)
     known = simulations(2000, is_tuned=True)
@@ -209,16 +193,17 @@ def test_noise_and_averaged_embeddings_are_those_of_the_gaussian_problem() -> No
     assert torch.equal(untuned.averaged, untuned.embedded)
 
 
+def gaps(real: Tensor, known: Simulations) -> Tensor:
+    return distances(real, known.embedded, known.averaged)
+
+
 def test_distances_to_simulations_agree_with_brute_force() -> None:
     torch.manual_seed(14)
-    known = simulations(700)
-    real = torch.randn(30, 2).double()
+    known, real = simulations(700), torch.randn(30, 2).double()
     every = torch.cdist(known.embedded, known.embedded)
     limit = every.fill_diagonal_(torch.inf).amin(dim=1).max()
     nearest = (real[:, None] - known.embedded[None]).norm(dim=2).amin(dim=1)
-    assert torch.allclose(
-        distances(real, known.embedded, known.averaged), nearest / limit, rtol=1e-6
-    )
+    assert torch.allclose(gaps(real, known), nearest / limit, rtol=1e-6)
 
 
 def test_simulations_are_flagged_as_often_as_stated() -> None:
@@ -226,11 +211,7 @@ def test_simulations_are_flagged_as_often_as_stated() -> None:
     counts = 0
     for _ in range(20):
         known = simulations(1000)
-        counts += int(
-            (
-                distances(simulations(500).embedded, known.embedded, known.averaged) > 1
-            ).sum()
-        )
+        counts += int((gaps(simulations(500).embedded, known) > 1).sum())
     # 20 expected; flags of one set of simulations come together.
     assert 5 <= counts <= 45
     # Of 500 observations, one batch in a hundred has more than four.
@@ -240,7 +221,6 @@ def test_simulations_are_flagged_as_often_as_stated() -> None:
     distance[7] = 1.5
     assert not unmatched(distance, 1000).alarming
     distance[7] = 2.5
-    assert unmatched(distance, 1000).alarming
     assert "Look at 7 before" in unmatched(distance, 1000).sentence
 
 
@@ -252,8 +232,9 @@ def test_categories_of_a_right_simulator_have_simulations_near_them() -> None:
     known = Simulations(theta[:1000], embedded[:1000], tuned=True)
     real = known.average(embedded[1000:])
     # Averaging over noise moves observations between the categories.
-    assert (distances(real, known.embedded, known.embedded) > 1).double().mean() > 0.9
-    assert not unmatched(distances(real, known.embedded, known.averaged), 1000).alarming
+    unmoved = replace(known, tuned=False)
+    assert (gaps(real, unmoved) > 1).double().mean() > 0.9
+    assert not unmatched(gaps(real, known), 1000).alarming
 
 
 @pytest.mark.medium
@@ -351,17 +332,6 @@ def test_the_p_value_is_the_share_of_divisions_as_far_apart() -> None:
     assert two_sample_test(a, b).p_value == pytest.approx(expected, abs=0.04)
 
 
-@pytest.mark.slow
-def test_sets_of_one_distribution_seldom_differ_and_a_narrow_one_does() -> None:
-    torch.manual_seed(35)
-    x = torch.randn(40, 60, 3)
-    tests = [two_sample_test(a[:20], a[20:]) for a in x[:20]]
-    assert sum(test.is_different for test in tests) <= 2
-    tests = [two_sample_test(a[:20], 0.3 * a[20:]) for a in x[20:]]
-    assert all(test.is_different for test in tests)
-    assert sum(test.spread for test in tests) / 20 == pytest.approx(0.3, abs=0.03)
-
-
 def test_pairs_with_the_same_parameters_count_once() -> None:
     torch.manual_seed(36)
     # Six people with ten recordings each, all of them alike.
@@ -370,6 +340,7 @@ def test_pairs_with_the_same_parameters_count_once() -> None:
     test = compare_with_pairs(people, groups, batch)
     alone = two_sample_test(people[:6], batch)
     assert test.p_value == pytest.approx(alone.p_value, abs=0.02)
+    assert two_sample_test(batch[:25], 0.2 * batch[25:]).spread < 0.4
     assert compare_with_pairs(people[:4], groups[:4], batch) is None
 
 
