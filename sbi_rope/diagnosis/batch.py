@@ -32,6 +32,7 @@ from sbi_rope.utils.settings import Range, check, default_names, names_of
 FEWEST_SIMULATIONS = 100
 # Above this p-value there is no sign of a difference.
 NO_SIGN = 0.05
+Folds = Annotated[int, Range(2)]
 
 
 def diagnose(
@@ -90,7 +91,7 @@ def diagnose(
     """
     check("rope", rope, RoPE)
     check("posterior", posterior, MixturePosterior | None)
-    check("num_folds", num_folds, Annotated[int, Range(2)] | None)
+    check("num_folds", num_folds, Folds | None)
     x_o = rope.checked_observations(x_o)  # before anybody waits for a training
     pairs, tuned = rope.pairs, len(rope.pairs) > 0
     if tuned and not rope.is_trained:

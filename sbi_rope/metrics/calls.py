@@ -85,7 +85,7 @@ def samples_of(
 def log_probs_of(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
     """Return the log density of each true parameter, float64, shape ``(n,)``."""
     is_direct = isinstance(posterior, DirectPosterior) and not is_bounded(posterior)
-    arguments = {"norm_posterior": False} if is_direct else {}
+    arguments: Any = {"norm_posterior": False} if is_direct else {}
     with torch.no_grad():
         found = posterior.log_prob_batched(theta, x=x.clone(), **arguments)
     if found.numel() != len(theta):
