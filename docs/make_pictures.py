@@ -233,8 +233,6 @@ def main() -> None:
     save(gammas(rope, theta_o[OBSERVED], x_o), "gammas")
     save(other_prior(rope, theta_o, x_o), "other_prior")
     save(plots.finetuning_history(rope.history), "finetuning")
-    coupling = rope.build_posterior(x_o, seed=0, **QUIET).coupling
-    save(plots.effective_sample_sizes(coupling), "effective_sample_sizes")
     posterior = stack(rope, learning_curve=True, seed=0, **QUIET)
     print(posterior.report)
     save(learning_curve(posterior.report), "learning_curve")

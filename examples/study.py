@@ -226,7 +226,6 @@ class Study:
             ),
             "calibration": plots.calibration_curves(evaluations),
             "finetuning": plots.finetuning_history(rope.history),
-            "coupling": plots.effective_sample_sizes(posterior.coupling),
         }
         for kind, figure in figures.items():
             self._save(figure, f"{kind}_{name}")

@@ -19,11 +19,9 @@ from sbi_rope.diagnosis.misspecification import (
     unlike_pairs,
     unmatched,
 )
-from sbi_rope.diagnosis.prior_shift import prior_shift, shifts
+from sbi_rope.diagnosis.prior_shift import Simulations, cross_fit, prior_shift, shifts
 from sbi_rope.diagnosis.report import Diagnosis, Finding
-from sbi_rope.diagnosis.residuals import cross_fit, residual_finding
-from sbi_rope.diagnosis.simulations import Simulations
-from sbi_rope.metrics.statistics import compare_with_pairs
+from sbi_rope.metrics.statistics import TwoSampleTest, compare_with_pairs
 from sbi_rope.rope.rope import RoPE
 from sbi_rope.utils.errors import InvalidInputError
 from sbi_rope.utils.progress import is_shown
@@ -32,6 +30,8 @@ from sbi_rope.utils.settings import Range, check, default_names, names_of
 
 # With fewer simulations the thresholds cannot be estimated.
 FEWEST_SIMULATIONS = 100
+# Above this p-value there is no sign of a difference.
+NO_SIGN = 0.05
 Folds = Annotated[int, Range(2)]
 
 
@@ -53,14 +53,12 @@ def diagnose(
     2. Is an entry of x many standard deviations away from simulations?
     3. Do the parameters of the batch follow the prior? The parameters of
        simulations, weighted by the coupling at tau = 0, are compared with the prior.
-    4. Does :math:`h(x_o)` differ from :math:`h(x_s)`? This is sbi's MMD test.
+    4. Does :math:`h(x_o)` differ from :math:`h(x_s)`? This is an MMD test.
     5. Does :math:`g(x_o)` still differ from simulations, after tuning?
     6. Which observations have no simulation near them?
     7. How many simulations are behind each posterior?
-    8. Do the residuals :math:`g(x) - E[h(S(\theta))]` of calibration pairs depend on
-       :math:`\theta`? They are computed on pairs that g was not trained on.
 
-    The last four are about RoPE only. Without calibration pairs g is h, and 1, 5 and 8
+    The last three are about RoPE only. Without calibration pairs g is h, and 1 and 5
     are left out. Each of 1, 3, 4, 5 and 6 raises an alarm by chance in one batch of
     a hundred. The thresholds of 7 are rules of thumb about gamma.
 
@@ -70,10 +68,10 @@ def diagnose(
         x_o: The batch, shape ``(n_o, *event)``.
         num_simulations: n_s, at least 100. If None, ``max(n_o, 1000)``, or all stored
             simulations if there are fewer.
-        num_folds: The number of trainings for 8, each of which takes as long as
-            ``rope.train``. None leaves out 8, and the allowance for errors of g in 3.
+        num_folds: The number of folds of the pairs for the allowance for errors of g in
+            3, each of which takes as long as ``rope.train``. None does without it.
         posterior: The posterior that you use, made with the same pairs. For a stack 5
-            to 8 are left out; 6 takes the place of 2 if x is not standardised. A shift
+            to 7 are left out; 6 takes the place of 2 if x is not standardised. A shift
             of 3 is no alarm if the stack has learned it from the pairs, and 1 shows no
             sign of a difference.
         parameter_names: One name for each parameter. If None, those of ``rope``, or
@@ -104,56 +102,50 @@ def diagnose(
         batch = rope.embed(
             x_o, num_simulations=num_simulations, show_progress_bars=show_progress_bars
         )
-        if len(batch.theta) < FEWEST_SIMULATIONS:
+        n_s, dim = batch.theta.shape
+        if n_s < FEWEST_SIMULATIONS:
             raise InvalidInputError(
                 f"Expected at least {FEWEST_SIMULATIONS} simulations, to estimate the "
-                f"thresholds; got {len(batch.theta)}."
+                f"thresholds; got {n_s}."
             )
-        dim = batch.theta.shape[1]
         names = rope.parameter_names or default_names(dim)
         if parameter_names is not None:
             names = names_of(parameter_names, dim)
         npe, real, simulated = batch.npe, _moved(batch.real), _moved(batch.simulated)
         simulations = Simulations(_moved(batch.theta), simulated, tuned)
         embedded = npe.embed("x_o", batch.x_o, npe.h)
-        before = mmd_test(_moved(embedded), simulated, null=simulated)
+        before = mmd_test(_moved(embedded), simulated, simulated)
         like_pairs = after = held_out = None
         if tuned:
             of_pairs, groups = npe.embed("x", pairs.x, npe.h), pairs.group.cpu()
             like_pairs = compare_with_pairs(of_pairs, groups, embedded, npe.density())
-            after = mmd_test(real, simulated, null=simulations.averaged)
-        distance = distances(real, simulations)
+            after = mmd_test(real, simulated, simulations.averaged)
+        distance = distances(real, simulated, simulations.averaged)
         if num_folds is not None and pairs.num_groups > 1:
-            show = is_shown(show_progress_bars)
-            held_out = cross_fit(rope, num_folds=num_folds, show_progress_bars=show)
+            held_out = cross_fit(rope, num_folds, show=is_shown(show_progress_bars))
         shift = prior_shift(real, simulations, held_out)
-        learned: tuple[str, ...] = ()
-        if like_pairs and not like_pairs.is_different and _has_learned(posterior):
-            learned = like_pairs.alike(names)
-        far = far_entries(npe.h, batch.x_o)
+        far, near = far_entries(npe.h, batch.x_o), unmatched(distance, n_s)
         findings = [
             unlike_pairs(like_pairs, names),
             far,
-            *shifts(shift, simulations, names, learned),
+            *shifts(shift, simulations, names, _learned(posterior, like_pairs, names)),
             before_tuning(before, tuned=tuned),
         ]
-        if hasattr(posterior, "report"):  # a stack, which does without a coupling
-            if far.value is None:  # so that a single broken observation is found
-                findings.append(unmatched(distance, len(simulated)))
-        else:
+        if not hasattr(posterior, "report"):
             findings += [
-                after_tuning(after, before),
-                unmatched(distance, len(simulated)),
-                effective_sizes(batch.couple(rope.coupler), len(simulated)),
-                residual_finding(pairs, held_out, simulations),
+                after_tuning(after),
+                near,
+                effective_sizes(batch.couple(rope.coupler), n_s),
             ]
+        elif far.value is None:  # a stack, of which a broken observation must be found
+            findings.append(near)
         # So many that a histogram is smooth.
         prior = _moved(npe.prior.sample(torch.Size((20_000,))))
     if tuned and posterior is None:
         sentence = "Not known. Pass `posterior=` to count only the alarms about it."
         findings.append(Finding("posterior in use", sentence))
     return Diagnosis(
-        findings=tuple(findings),
+        findings=tuple(sorted(findings, key=lambda one: not one.alarming)),
         distance=distance,
         theta=simulations.theta,
         implied=shift.implied,
@@ -163,12 +155,18 @@ def diagnose(
     )
 
 
-def _has_learned(posterior: MixturePosterior | None) -> bool:
-    """Tell whether it is a stack that learned other parameters than the prior's."""
-    if (report := getattr(posterior, "report", None)) is None:
-        return False
-    learns = len(report.keep_prior) < len(report.names)
-    return learns and is_improbable(report.probability_of_prior)
+def _learned(
+    posterior: MixturePosterior | None, test: TwoSampleTest | None, names: Sequence[str]
+) -> list[str]:
+    """Return parameters of a batch like the pairs, whose values the stack learned."""
+    report = getattr(posterior, "report", None)
+    if report is None or test is None or test.is_different:
+        return []
+    keeps_prior = len(report.keep_prior) == len(report.names)
+    if keeps_prior or not is_improbable(report.probability_of_prior):
+        return []
+    each = zip(names, test.p_values, strict=True)
+    return [name for name, p_value in each if p_value > NO_SIGN]
 
 
 def _moved(values: Tensor) -> Tensor:

@@ -1,22 +1,20 @@
 """Test whether a batch is like simulations and pairs, and has simulations near it."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 from scipy.stats import binom
 from torch import Tensor, nn
 
 from sbi_rope.coupling import Coupling
-from sbi_rope.diagnosis.report import UNLIKE_PAIRS, Finding
-from sbi_rope.diagnosis.simulations import Simulations, nearest_distances
+from sbi_rope.diagnosis.report import Finding
 from sbi_rope.metrics.statistics import LEVEL, TwoSampleTest
-from sbi_rope.npe.sbi import squared_mmd
 from sbi_rope.npe.standardisation import FAR, deviations
 
 # The most observations and simulations in one MMD, whose cost is quadratic.
 MAX_OBSERVATIONS, MAX_SIMULATIONS = 200, 400
 NUM_DRAWS = 200
+CHUNK = 500  # rows of distances that are computed at a time
 # An observation is flagged if its nearest simulation is farther away than the nearest
 # neighbours of all simulations but this share.
 FLAGGED_SHARE = 0.001
@@ -30,23 +28,8 @@ FEW, MANY_WITH_FEW = 10.0, 0.05
 INDISTINCT = 0.5
 
 
-class MMDTest(NamedTuple):
-    """The squared MMD of a batch, its usual value, and how often one is as large."""
-
-    mmd: float
-    usual: float
-    p_value: float
-
-    def __str__(self) -> str:
-        ratio = self.mmd / max(self.usual, 1e-300)
-        return (
-            f"its squared MMD is {ratio:.{0 if ratio >= 10 else 1}f} times that of a "
-            f"batch of simulations (p = {self.p_value:.2g})"
-        )
-
-
-def mmd_test(batch: Tensor, simulated: Tensor, *, null: Tensor) -> MMDTest:
-    r"""Test whether a batch is like simulations, with sbi's MMD.
+def mmd_test(batch: Tensor, simulated: Tensor, null: Tensor) -> tuple[float, float]:
+    """Return the squared MMD of a batch in units of its usual value, and a p-value.
 
     At most 200 random rows of the batch ``(n_o, l)`` are used. Under the null
     hypothesis, it has embeddings as in ``null``, one for each simulation ``(n_s, l)``.
@@ -65,62 +48,82 @@ def mmd_test(batch: Tensor, simulated: Tensor, *, null: Tensor) -> MMDTest:
     for i in range(NUM_DRAWS):
         order = torch.randperm(len(simulated))[: num_real + num_simulated]
         real, other = order[:num_real], order[num_real:]
-        usual[i] = squared_mmd(null[real], simulated[other])
+        usual[i] = _squared_mmd(null[real], simulated[other])
     other = torch.randperm(len(simulated))[:num_simulated]
-    value = squared_mmd(chosen, simulated[other])
+    value = _squared_mmd(chosen, simulated[other])
     # The batch itself counts as one of the draws, so that p is never 0.
     p_value = (1 + int((usual >= value).sum())) / (1 + NUM_DRAWS)
-    return MMDTest(value, float(usual.median()), p_value)
+    return value / max(float(usual.median()), 1e-300), p_value
 
 
-def before_tuning(test: MMDTest, *, tuned: bool) -> Finding:
+def _squared_mmd(a: Tensor, b: Tensor) -> float:
+    """Return the squared MMD of two sets, Gaussian, of the median width."""
+    across = torch.cdist(a, b)
+    scale = -0.5 / across.median().square()
+    aa, ab, bb = (
+        (distance.square() * scale).exp().mean()
+        for distance in (torch.cdist(a, a), across, torch.cdist(b, b))
+    )
+    return float(aa + bb - 2 * ab)
+
+
+def before_tuning(test: tuple[float, float], *, tuned: bool) -> Finding:
     """Say whether h(x_o) is unlike h(x_s), which pairs can repair."""
-    is_unlike = test.p_value < LEVEL
-    sentence = f"No sign of it (p = {test.p_value:.2g})."
-    if is_unlike:
-        sentence = f"NPE sees the batch as unlike simulations: {test}. " + (
-            "This is what the calibration pairs repair, and no alarm."
-            if tuned
-            else "Either the simulator is wrong or the batch has other parameters than "
-            "the prior. Append calibration pairs, which repair the first."
+    advice = "This is what the calibration pairs repair, and no alarm."
+    if not tuned:
+        advice = (
+            "Either the simulator is wrong or the batch has other parameters than the "
+            "prior. Append calibration pairs, which repair the first."
         )
-    name, alarming = "misspecification before tuning", is_unlike and not tuned
-    return Finding(name, sentence, alarming, test.p_value, LEVEL)
+    text = f"{_unlike('NPE', *test)} {advice}"
+    name = "misspecification before tuning"
+    return _by_p_value(name, test[1], text, is_alarm=not tuned)
 
 
-def after_tuning(test: MMDTest | None, before: MMDTest) -> Finding:
+def after_tuning(test: tuple[float, float] | None) -> Finding:
     """Say whether tuning has moved the batch among the simulations."""
     name = "misspecification after tuning"
     if test is None:
         return Finding(name, "Not tested, because there are no calibration pairs.")
-    is_unlike = test.p_value < LEVEL
-    course = f"{before.mmd:.2g} before tuning and {test.mmd:.2g} after"
-    sentence = f"No sign of it (p = {test.p_value:.2g}; the squared MMD is {course})."
-    if is_unlike:
-        sentence = (
-            f"RoPE's tuned embedding net sees the batch as unlike simulations: {test}. "
-            f"It is {course}. Append more calibration pairs like the batch, or lower "
-            "tau if the batch is narrower than the prior or shifted."
-        )
-    return Finding(name, sentence, is_unlike, test.p_value, LEVEL)
+    advice = (
+        "Append more calibration pairs like the batch, or lower tau if the batch is "
+        "narrower than the prior or shifted."
+    )
+    text = _unlike("RoPE's tuned embedding net", *test)
+    return _by_p_value(name, test[1], f"{text} {advice}")
 
 
 def unlike_pairs(test: TwoSampleTest | None, names: Sequence[str]) -> Finding:
     """Say whether what was found on the pairs holds for the batch."""
+    name = "batch unlike the calibration pairs"
     if test is None:
         few = "five observations and five pairs with different labels (or groups)"
-        return Finding(UNLIKE_PAIRS, f"Not tested, because this needs {few}.")
-    sentence = f"No sign of it (p = {test.p_value:.2g})."
-    if test.is_different:
-        found = ", ".join(test.parameters(names))
-        where = f", and its parameters differ in {found}" if found else ""
-        sentence = (
-            f"NPE sees the batch as unlike the pairs (p = {test.p_value:.2g}): its "
-            f"observations are {test.spread:.2f} times as far apart{where}. Label some "
-            "observations like those of the batch. Weights, scores, calibration and "
-            "guarantees that were found on the pairs need not hold here."
-        )
-    return Finding(UNLIKE_PAIRS, sentence, test.is_different, test.p_value, LEVEL)
+        return Finding(name, f"Not tested, because this needs {few}.")
+    found = ", ".join(test.parameters(names))
+    where = f", and its parameters differ in {found}" if found else ""
+    text = (
+        f"NPE sees the batch as unlike the pairs (p = {test.p_value:.2g}): its "
+        f"observations are {test.spread:.2f} times as far apart{where}. Label some "
+        "observations like those of the batch. Weights, scores, calibration and "
+        "guarantees that were found on the pairs need not hold here."
+    )
+    return _by_p_value(name, test.p_value, text)
+
+
+def _unlike(net: str, ratio: float, p_value: float) -> str:
+    return (
+        f"{net} sees the batch as unlike simulations: its squared MMD is "
+        f"{ratio:.{0 if ratio >= 10 else 1}f} times that of a batch of simulations "
+        f"(p = {p_value:.2g})."
+    )
+
+
+def _by_p_value(
+    name: str, p_value: float, text: str, *, is_alarm: bool = True
+) -> Finding:
+    is_unlike = p_value < LEVEL
+    sentence = text if is_unlike else f"No sign of it (p = {p_value:.2g})."
+    return Finding(name, sentence, is_unlike and is_alarm, p_value, LEVEL)
 
 
 def far_entries(embedding_net: nn.Module, x_o: Tensor) -> Finding:
@@ -141,23 +144,32 @@ def far_entries(embedding_net: nn.Module, x_o: Tensor) -> Finding:
     return Finding(name, sentence, value > FAR, value, FAR)
 
 
-def distances(real: Tensor, simulations: Simulations) -> Tensor:
+def distances(real: Tensor, simulated: Tensor, averaged: Tensor) -> Tensor:
     """Return how far ``real`` is from the nearest simulation, where 1 is the limit.
 
     One or two in a thousand simulations exceed the limit if they take the place of
     observations. A tuned g averages over the simulator's noise, and may put
     observations between simulations, such as between the categories of an entry. The
-    limit allows for that.
+    limit allows for that, by the ``averaged`` simulations.
     """
-    embedded, averaged = simulations.embedded, simulations.averaged
     # A new value exceeds the (k+1)-th largest of n with probability (k + 1) / (n + 1).
-    k = int(FLAGGED_SHARE * len(embedded))
+    k = int(FLAGGED_SHARE * len(simulated))
     limit = max(
-        float(nearest_distances(ends, embedded, others=True).sort().values[-1 - k])
-        for ends in (embedded, averaged)
+        float(_nearest(ends, simulated, others=True).sort().values[-1 - k])
+        for ends in (simulated, averaged)
     )
-    smallest = torch.finfo(torch.float64).tiny
-    return nearest_distances(real, embedded) / max(limit, smallest)
+    return _nearest(real, simulated) / max(limit, torch.finfo(torch.float64).tiny)
+
+
+def _nearest(points: Tensor, among: Tensor, *, others: bool = False) -> Tensor:
+    """Return the distance to the nearest, or the nearest in any of the other rows."""
+    nearest = []
+    for rows in torch.arange(len(points)).split(CHUNK):
+        distance = torch.cdist(points[rows], among)
+        if others:
+            distance.scatter_(1, rows[:, None], torch.inf)
+        nearest.append(distance.amin(dim=1))
+    return torch.cat(nearest)
 
 
 def unmatched(distance: Tensor, num_simulations: int) -> Finding:
@@ -201,7 +213,5 @@ def effective_sizes(coupling: Coupling, num_simulations: int) -> Finding:
             " This is almost the prior. Lower gamma, or, for a single observation, use "
             "`stack(rope)`, which needs no batch."
         )
-    if not coupling.converged:
-        sentence += " The coupling has not converged, so that this is approximate."
     name, alarming = "simulations behind each posterior", value > threshold
     return Finding(name, sentence, alarming, value, threshold)

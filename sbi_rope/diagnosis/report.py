@@ -5,8 +5,6 @@ from dataclasses import dataclass, field
 
 from torch import Tensor
 
-UNLIKE_PAIRS = "batch unlike the calibration pairs"
-
 
 @dataclass(frozen=True)
 class Finding:
@@ -40,8 +38,8 @@ class Diagnosis:
     of a name. All tensors are float64 on the CPU unless said otherwise.
 
     Attributes:
-        findings: What the tests found that concern the posterior in use; ready for
-            ``pandas.DataFrame``.
+        findings: What the tests found that concern the posterior in use, alarms first;
+            ready for ``pandas.DataFrame``.
         distance: Distance from :math:`g(x_o)` to the nearest simulation, ``(n_o,)``, in
             units of the limit above which an observation is flagged.
         theta: The parameters of the simulations, ``(n_s, d)``.
@@ -71,29 +69,19 @@ class Diagnosis:
         """The findings that are alarms."""
         return tuple(one for one in self.findings if one.alarming)
 
-    @property
-    def ordered(self) -> tuple[Finding, ...]:
-        """The findings, alarms first."""
-        return tuple(sorted(self.findings, key=lambda one: not one.alarming))
-
-    @property
-    def verdict(self) -> str:
-        """How many alarms there are, such as "1 alarm in 10 tests."."""
-        tests = sum(one.value is not None for one in self.findings)
-        count = len(self.alarming)
-        return f"{count or 'no'} alarm{'s' * (count > 1)} in {tests} tests."
-
     def __getitem__(self, name: str) -> Finding:
         """Return the finding of a name."""
         return {one.name: one for one in self.findings}[name]
 
     def __str__(self) -> str:
-        count = len(self.distance)
+        count, alarms = len(self.distance), len(self.alarming)
+        tests = sum(one.value is not None for one in self.findings)
         title = (
             f"Diagnosis of {count} observation{'s' * (count > 1)} against "
-            f"{len(self.theta)} simulations: {self.verdict}"
+            f"{len(self.theta)} simulations: {alarms or 'no'} "
+            f"alarm{'s' * (alarms > 1)} in {tests} tests."
         )
-        return "\n".join([_wrapped(title), *map(str, self.ordered)])
+        return "\n".join([_wrapped(title), *map(str, self.findings)])
 
 
 def _wrapped(text: str) -> str:

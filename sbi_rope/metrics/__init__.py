@@ -6,7 +6,7 @@ consists of ``theta``, shape ``(n, d)``, and ``x``, shape ``(n, *event_shape)``.
 """
 
 from sbi_rope.metrics.calls import draw_samples
-from sbi_rope.metrics.evaluation import Dependence, Evaluation, evaluate
+from sbi_rope.metrics.evaluation import Evaluation, evaluate
 from sbi_rope.metrics.statistics import Estimate
 
-__all__ = ["Dependence", "Estimate", "Evaluation", "draw_samples", "evaluate"]
+__all__ = ["Estimate", "Evaluation", "draw_samples", "evaluate"]

@@ -2,10 +2,9 @@
 
 import math
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Any, Literal
+from typing import Annotated, Any
 
 import torch
 from scipy.stats import rankdata
@@ -18,17 +17,19 @@ from sbi_rope.data.pairs import (
     one_of_each_group,
 )
 from sbi_rope.metrics.calls import (
-    CHUNK_SIZE,
-    NumSamples,
-    draw_chunks,
-    evaluate_log_probs,
-    read_test_set,
+    MAX_SAMPLES,
+    log_probs_of,
+    read_theta,
+    read_x,
+    samples_of,
 )
-from sbi_rope.metrics.statistics import Estimate, permutation_test
+from sbi_rope.metrics.statistics import Estimate
 from sbi_rope.npe.prior import PriorDistribution
+from sbi_rope.utils.errors import InvalidInputError
+from sbi_rope.utils.progress import progress_bar
 from sbi_rope.utils.seeds import seeded
-from sbi_rope.utils.settings import Positive, check, default_names
-from sbi_rope.utils.tensors import as_batch
+from sbi_rope.utils.settings import Positive, Range, check, default_names
+from sbi_rope.utils.tensors import as_batch, rows_with
 
 # The level of the intervals whose coverage is stated.
 LEVEL = 0.9
@@ -36,47 +37,18 @@ LEVEL = 0.9
 FEWEST = 5
 # With fewer observations no dependence on the estimate could be significant.
 FEWEST_FOR_DEPENDENCE = 10
+NUM_PERMUTATIONS = 1000
 # The chance that a calibrated posterior has a parameter that is called dependent.
 FALSE_ALARMS = 0.05
-NUM_PARTS = 3
 NOMINAL = torch.arange(1, 100, dtype=torch.double) / 100
 # Levels are ratios of integers. Those that are equal before rounding must be after it.
 ROUNDING = 1e-9
 ACAUC_IN_WORDS = "0 is calibrated, positive is over-confident, negative is too wide"
-
-Verdict = Literal["over-confident", "too wide", "calibrated", "unknown"]
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Dependence:
-    """The coverage of intervals where estimates are low, middling and high.
-
-    Attributes:
-        p_values: The p-value of each parameter; NaN with fewer than ten observations.
-        shares: The share of true parameters inside their 90 % intervals, for the
-            lowest, the middle and the highest third of the estimates, shape ``(d, 3)``.
-        above: The share of true parameters above the posterior's median in each third,
-            shape ``(d, 3)``; about one half if the posterior is calibrated.
-        edges: The estimates that divide the thirds, shape ``(d, 2)``.
-    """
-
-    p_values: tuple[float, ...]
-    shares: Tensor = field(repr=False)
-    above: Tensor = field(repr=False)
-    edges: Tensor = field(repr=False)
-
-    @property
-    def num_tested(self) -> int:
-        """The number of parameters with a p-value."""
-        return sum(not math.isnan(p_value) for p_value in self.p_values)
-
-    @property
-    def found(self) -> tuple[bool, ...]:
-        """Whether the coverage of each parameter depends on its estimate.
-
-        At most one calibrated posterior in twenty has such a parameter (Bonferroni).
-        """
-        return tuple(p * self.num_tested < FALSE_ALARMS for p in self.p_values)
+# How many observations a posterior is called with at a time.
+CHUNK_SIZE = 100
+# By a single draw all posteriors look calibrated whose draws are too large as often as
+# too small.
+NumSamples = Annotated[int, Range(20, MAX_SAMPLES)]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -122,14 +94,15 @@ class Evaluation:
     @property
     def num_independent(self) -> float:
         """The number of independent observations of equal weight that tell as much."""
-        return self._number(torch.ones_like(self.log_prob, dtype=torch.bool))
+        return self._number(torch.ones(len(self)))
 
-    def _number(self, rows: Tensor) -> float:
-        weight = torch.ones(len(self)) if self.weight is None else self.weight.cpu()
-        weight = weight[rows := rows.cpu()]
+    def _number(self, is_known: Tensor) -> float:
+        weight = is_known.double().cpu()
+        if self.weight is not None:
+            weight = weight * self.weight.cpu()
         if self.group is not None:
-            weight = group_means(weight, weight, self.group.cpu()[rows])[1]
-        return effective_number(weight) if len(weight) else 0.0
+            weight = group_means(weight, weight, self.group.cpu())[1]
+        return effective_number(weight)
 
     def mean(self, values: Tensor, *, confidence: float = 0.95) -> Estimate:
         """Return the mean over observations of one number each, shape ``(n,)``."""
@@ -161,9 +134,7 @@ class Evaluation:
     def levels(self) -> Tensor:
         r"""The level of the smallest central interval that holds each true parameter.
 
-        .. math:: a^* = |2 u - 1|
-
-        Here u is the rank. The shape is ``(n, d)``.
+        It is :math:`a^* = |2 u - 1|`, with the rank u. The shape is ``(n, d)``.
         """
         return (2 * self.ranks.double() - 1).abs()
 
@@ -178,12 +149,7 @@ class Evaluation:
         The interval is wider than that of other means by :math:`\sqrt{n / (n - 1)}`.
         Without this factor, it would be too narrow for a few uniform levels. With it,
         the interval leaves 0 out for 4 to 5 % of calibrated posteriors, with 10 to 50
-        observations and one to five parameters.
-
-        References:
-            | Addressing Misspecification in Simulation-based Inference through
-            | Data-driven Calibration (Wehenkel et al., 2025), section 4, Metrics
-            | https://arxiv.org/abs/2405.08719
+        observations and one to five parameters. The paper is that of :attr:`lpp`.
         """
         return self._acauc(self.levels.nanmean(dim=1), 0.95)
 
@@ -198,32 +164,26 @@ class Evaluation:
         return tuple(self._acauc(one, 1 - 0.05 / len(columns)) for one in columns)
 
     def _acauc(self, levels: Tensor, confidence: float) -> Estimate:
-        found, n = (
-            self.mean(levels, confidence=confidence),
-            self._number(~levels.isnan()),
-        )
+        found = self.mean(levels, confidence=confidence)
+        mean, n = found.mean - 0.5, self._number(~levels.isnan())
         half = (found.high - found.mean) * (n / max(1.0, n - 1)) ** 0.5
-        mean = found.mean - 0.5
         return Estimate(mean, mean - half, mean + half)
 
     @property
     def coverage(self) -> Tensor:
         """The share of true parameters in the central intervals of levels .01 to .99.
 
-        Of each parameter, shape ``(99, d)``. It is exact to about one over the number
-        of samples behind the ranks.
+        Of each parameter, shape ``(99, d)``; NaN if it is not known anywhere. It is
+        exact to about one over the number of samples behind the ranks.
         """
-        return torch.stack([self._inside(float(level)) for level in NOMINAL])
-
-    def inside(self, level: float) -> float:
-        """Return the share of true parameters in central intervals of a level."""
-        return float(self._inside(level).nanmean())
-
-    def _inside(self, level: float) -> Tensor:
-        return _means(self._event(self.levels <= level + ROUNDING), self.weight)
-
-    def _event(self, happened: Tensor) -> Tensor:
-        return happened.double().where(~self.ranks.isnan(), torch.nan)
+        levels, known = self.levels, ~self.ranks.isnan()
+        weight = torch.ones(len(self)) if self.weight is None else self.weight
+        weights = weight.to(levels)[:, None] * known
+        shares = [
+            (weights * (levels <= level + ROUNDING)).sum(dim=0)
+            for level in NOMINAL.tolist()
+        ]
+        return torch.stack(shares) / weights.sum(dim=0)
 
     @property
     def expected_coverage_error(self) -> float:
@@ -232,52 +192,32 @@ class Evaluation:
         Over-confidence in one parameter cannot cancel under-confidence in another. A
         calibrated posterior has about :math:`0.31 / \sqrt{n}`.
         """
-        gap = self.coverage - NOMINAL[:, None].to(self.ranks.device)
-        return float(gap.abs().nanmean())
+        coverage = self.coverage
+        return float((coverage - NOMINAL[:, None].to(coverage)).abs().nanmean())
 
-    @cached_property
-    def dependence(self) -> Dependence:
-        r"""Whether coverage depends on the estimate, by a permutation test.
+    @property
+    def dependence(self) -> tuple[float, ...]:
+        r"""P-values of a test whether the coverage of a parameter depends on its value.
 
         Coverage that is right on average can be wrong for small and for large
         parameters. The ranks u and the levels :math:`|2u - 1|` are regressed on the
-        ranks of the posterior means and on their squares. The ranks u show a bias that
-        differs from region to region, the levels a wrong width in some. The test is
-        exact if the posterior is calibrated, and does not react to errors that are the
-        same everywhere, which :attr:`acauc` measures. One observation of each group is
-        tested.
+        ranks of the posterior means and on their squares: u shows a bias, and the level
+        a wrong width, that differ from region to region. The permutation test is exact
+        if the posterior is calibrated, and does not react to errors that are the same
+        everywhere. One observation of each group is tested. The p-value of a parameter
+        is NaN with fewer than ten observations.
 
         References:
             | Validating Bayesian Inference Algorithms with Simulation-Based Calibration
             | (Talts et al., 2018), on the ranks
             | https://arxiv.org/abs/1804.06788
         """
-        ranks, estimates = self.ranks.cpu().double(), self.estimates.cpu().double()
-        known = ~torch.isnan(ranks)
-        tested = known
+        tested = ~self.ranks.cpu().isnan()
         if self.group is not None:
-            chosen = one_of_each_group(groups_of(self.group), seed=0)
-            tested = known & chosen.cpu()[:, None]
-        columns = range(ranks.shape[1])
-        # A third of the observations each, even if estimates are equal.
-        place = estimates.where(known, torch.inf).argsort(dim=0, stable=True)
-        part = place.argsort(dim=0) * NUM_PARTS // known.sum(dim=0).clamp_min(1)
-        weight = None if self.weight is None else self.weight.cpu()
-
-        def in_thirds(happened: Tensor) -> Tensor:
-            event = self._event(happened).cpu()
-            each = [event.where(part == t, torch.nan) for t in range(NUM_PARTS)]
-            return torch.stack([_means(one, weight) for one in each], dim=1)
-
-        return Dependence(
-            p_values=tuple(
-                _p_value(ranks[tested[:, k], k], estimates[tested[:, k], k])
-                for k in columns
-            ),
-            shares=in_thirds(self.levels <= LEVEL + ROUNDING),
-            above=in_thirds(self.ranks > 0.5),
-            edges=torch.stack([_edges(estimates[known[:, k], k]) for k in columns]),
-        )
+            tested &= one_of_each_group(groups_of(self.group), seed=0).cpu()[:, None]
+        ranks, means = self.ranks.cpu().double(), self.estimates.cpu().double()
+        columns = zip(ranks.T, means.T, tested.T, strict=True)
+        return tuple(_p_value(u[rows], mean[rows]) for u, mean, rows in columns)
 
     def as_row(self) -> dict[str, float]:
         """Return the main scores as the row of a table; an unknown one is NaN."""
@@ -288,81 +228,68 @@ class Evaluation:
             "expected_coverage_error": self.expected_coverage_error,
         }
 
-    def lines(
-        self, *, known: str = "true parameters", names: Sequence[str] | None = None
-    ) -> list[tuple[str, bool]]:
+    def lines(self, *, known: str = "true parameters") -> list[tuple[str, bool]]:
         """Return sentences about the calibration, and whether each is alarming.
 
         Args:
             known: What the intervals should hold.
-            names: A name for each parameter; :attr:`names` if None.
         """
-        n, names = self.num_independent, names or self.names
-        verdict = verdict_of(self.acauc)
+        n, verdict = self.num_independent, verdict_of(self.acauc)
         if verdict == "unknown":
             return [("Whether it is calibrated is not known.", False)]
         acauc = f"ACAUC {self.acauc:+.3f}; {ACAUC_IN_WORDS}"
         if n < FEWEST:
             return [(f"Too few observations to check calibration: {acauc}.", False)]
-        off = [
-            (f"{name} alone is {verdict_of(one)}: ACAUC {one:+.3f}.", True)
-            for name, one in zip(names, self.acauc_of_parameters, strict=True)
-            if verdict_of(one) in ("over-confident", "too wide") and len(names) > 1
-        ]
+        off, unknown = [], []
+        for name, one in zip(self.names, self.acauc_of_parameters, strict=True):
+            alone = verdict_of(one)
+            if math.isnan(one.mean):
+                text = f"{name} was not measured, so its width is not checked."
+                unknown.append((text, False))
+            elif alone in ("over-confident", "too wide") and len(self.names) > 1:
+                off.append((f"{name} alone is {alone}: ACAUC {one:+.3f}.", True))
+        start = f"The posterior is {verdict}"
         if verdict == "calibrated":
             average = ", on average over parameters," if off else ""
             what = "observations" if self.group is None else "groups"
             start = f"Calibrated{average} as far as {n:.0f} {what} can tell"
-        else:
-            start = f"The posterior is {verdict}"
-        return [
-            (f"{start}: {acauc}.", verdict != "calibrated"),
-            *off,
-            *(
-                (f"{name} was not measured, so its width is not checked.", False)
-                for name, column in zip(names, self.ranks.unbind(1), strict=True)
-                if column.isnan().all()
-            ),
-            (
-                f"50% intervals hold {self.inside(0.5):.0%} of the {known}, "
-                f"{LEVEL:.0%} intervals {self.inside(LEVEL):.0%}.",
-                False,
-            ),
-            *self._lines_on_dependence(known, names),
-        ]
-
-    def _lines_on_dependence(
-        self, known: str, names: Sequence[str]
-    ) -> list[tuple[str, bool]]:
-        found = self.dependence
-        if not found.num_tested:
-            return []
-        lines = [
-            (
-                f"The coverage of {name} depends on its estimate (p = {p_value:.1g}). "
-                f"Where estimates are low (below {edges[0]:.3g}), middling and high "
-                f"(above {edges[1]:.3g}), {LEVEL:.0%} intervals hold {_listed(shares)} "
-                f"of the {known}, and {_listed(above)} are above the median.",
-                True,
-            )
-            for name, p_value, edges, shares, above, depends in zip(
-                names,
-                found.p_values,
-                found.edges.tolist(),
-                found.shares.tolist(),
-                found.above.tolist(),
-                found.found,
-                strict=True,
-            )
-            if depends
-        ]
-        least = min(p for p in found.p_values if not math.isnan(p))
-        none = (
-            f"No sign that coverage depends on the estimate (smallest p-value of "
-            f"{found.num_tested}: {least:.2g}).",
-            False,
+        half, most = self.coverage[[49, 89]].nanmean(dim=1).tolist()
+        shares = (
+            f"50% intervals hold {half:.0%} of the {known}, {LEVEL:.0%} intervals "
+            f"{most:.0%}."
         )
-        return lines or [none]
+        first = f"{start}: {acauc}.", verdict != "calibrated"
+        return [first, *off, *unknown, (shares, False), *self._dependence_lines(known)]
+
+    def _dependence_lines(self, known: str) -> list[tuple[str, bool]]:
+        p_values, lines = self.dependence, []
+        tested = [p for p in p_values if not math.isnan(p)]
+        for k, p_value in enumerate(p_values):
+            if p_value * len(tested) < FALSE_ALARMS:  # Bonferroni
+                text = f"The coverage of {self.names[k]} depends on its estimate (p = "
+                text += f"{p_value:.1g}). {self._in_thirds(k, known)}"
+                lines.append((text, True))
+        if tested and not lines:
+            text = "No sign that coverage depends on the estimate (smallest p-value of "
+            lines.append((f"{text}{len(tested)}: {min(tested):.2g}).", False))
+        return lines
+
+    def _in_thirds(self, column: int, known: str) -> str:
+        ranks, estimates = self.ranks[:, column].cpu(), self.estimates[:, column].cpu()
+        rows = (~ranks.isnan()).nonzero().flatten()
+        thirds = rows[estimates[rows].argsort(stable=True)].tensor_split(3)
+        weight = torch.ones(len(self)) if self.weight is None else self.weight.cpu()
+        is_inside = self.levels[:, column].cpu() <= LEVEL + ROUNDING
+        inside, above = (
+            "{:.0%}, {:.0%} and {:.0%}".format(
+                *((weight * event)[i].sum() / weight[i].sum() for i in thirds)
+            )
+            for event in (is_inside, ranks > 0.5)
+        )
+        return (
+            f"In the lowest, middle and highest third of the estimates, {LEVEL:.0%} "
+            f"intervals hold {inside} of the {known}, and {above} are above the median."
+        )
 
     def __str__(self) -> str:
         n, d = self.ranks.shape
@@ -389,10 +316,11 @@ class Evaluation:
     __repr__ = __str__  # which notebooks show
 
 
-def verdict_of(acauc: Estimate) -> Verdict:
-    """Return what an ACAUC says; "unknown" where nothing was scored.
+def verdict_of(acauc: Estimate) -> str:
+    """Return "over-confident", "too wide", "calibrated" or "unknown".
 
-    It is "calibrated" unless the interval leaves 0 out.
+    It is "calibrated" unless the interval leaves 0 out, and "unknown" if nothing was
+    scored.
     """
     if math.isnan(acauc.low):
         return "unknown"
@@ -409,7 +337,6 @@ def evaluate(
     theta_std: Tensor | None = None,
     num_samples: int = 1000,
     seed: int | None = None,
-    chunk_size: int = CHUNK_SIZE,
     show_progress_bars: bool = False,
 ) -> Evaluation:
     r"""Score a posterior by the density of the true parameters and by calibration.
@@ -427,8 +354,7 @@ def evaluate(
             the standard deviations of the posterior's prior.
         num_samples: The number of posterior samples for each observation, 20 or more.
             A fifth of them is for the estimates, the others are for the ranks.
-        seed: The seed of the samples, which also depend on ``chunk_size``.
-        chunk_size: How many observations are scored at a time.
+        seed: The seed of the samples.
         show_progress_bars: Whether to show progress.
 
     Returns:
@@ -437,7 +363,6 @@ def evaluate(
     Raises:
         InvalidInputError: If an argument has the wrong shape or is not finite, or the
             posterior returns NaN.
-        LogProbUnavailableError: If the posterior has no ``log_prob_batched``.
 
     Example:
         >>> from sbi.utils import BoxUniform
@@ -447,27 +372,36 @@ def evaluate(
         >>> found.lpp.mean
         0.0
     """
-    theta, x = read_test_set(posterior, theta, x, chunk_size)
     check("num_samples", num_samples, NumSamples)
+    theta = read_theta(posterior, theta)
+    x = read_x(posterior, x, rows=len(theta))
+    chunks = [*zip(theta.split(CHUNK_SIZE), x.split(CHUNK_SIZE), strict=True)]
+
+    def bar(text: str) -> Iterable[tuple[Tensor, Tensor]]:
+        return progress_bar(chunks, show=show_progress_bars, desc=text)
+
     with seeded(seed):
-        log_prob = evaluate_log_probs(
-            posterior, theta, x, chunk_size=chunk_size, show=show_progress_bars
+        log_prob = torch.cat(
+            [log_probs_of(posterior, *chunk) for chunk in bar("Evaluating log_prob")]
         )
-        chunks = draw_chunks(
-            posterior,
-            theta,
-            x,
-            num_samples=num_samples,
-            chunk_size=chunk_size,
-            show=show_progress_bars,
-        )
-        found = [estimates_and_ranks(draws, theta[rows]) for rows, draws in chunks]
+        bad = torch.isnan(log_prob) | torch.isposinf(log_prob)
+        if bad.any():
+            raise InvalidInputError(
+                "Expected a posterior with finite results; got log-probabilities that "
+                f"are NaN or +Inf in {rows_with(bad)}."
+            )
+        found = [
+            estimates_and_ranks(
+                samples_of(posterior, some_x, num_samples, theta.shape[1]), some
+            )
+            for some, some_x in bar("Drawing samples")
+        ]
     estimates, ranks = (torch.cat(parts) for parts in zip(*found, strict=True))
     return Evaluation(
         log_prob=log_prob,
         ranks=ranks,
         estimates=estimates,
-        log_unit=_log_unit(posterior, theta_std, theta),
+        log_unit=_log_unit(posterior, theta_std, theta.shape[1]),
         parameter_names=getattr(posterior, "parameter_names", None),
     )
 
@@ -502,45 +436,39 @@ def estimates_and_ranks(samples: Tensor, theta: Tensor) -> tuple[Tensor, Tensor]
     return samples[is_mean].double().mean(dim=0), ranks
 
 
-def _log_unit(posterior: Any, theta_std: Tensor | None, theta: Tensor) -> float:
+def _log_unit(posterior: Any, theta_std: Tensor | None, dim: int) -> float:
     """Return the log of the units of theta, those of the prior if none are given."""
     if theta_std is None:
         try:
-            theta_std = PriorDistribution(posterior.prior).stddev
+            return float(PriorDistribution(posterior.prior).log_units().sum())
         except Exception:  # posteriors of users need not have a prior
             return math.nan
-    units = as_batch("theta_std", theta_std, (), rows=theta.shape[1])
+    units = as_batch("theta_std", theta_std, (), rows=dim)
     check("theta_std", float(units.min()), Positive)
     return float(units.double().log().sum())
 
 
-def _means(values: Tensor, weight: Tensor | None) -> Tensor:
-    """Return the weighted mean of columns ``(n, d)`` without their NaN, ``(d,)``."""
-    if weight is None:
-        return values.nanmean(dim=0)
-    weights = weight.to(values)[:, None] * ~torch.isnan(values)
-    return (weights * values.nan_to_num()).sum(dim=0) / weights.sum(dim=0)
-
-
 def _p_value(ranks: Tensor, estimates: Tensor) -> float:
+    """Return how often permuted ranks depend on the estimates as much as these."""
     if len(ranks) < FEWEST_FOR_DEPENDENCE:
         return math.nan
     place = torch.as_tensor(rankdata(estimates.numpy())) / len(estimates) * 2 - 1
+    features = torch.stack([place, place.square()], dim=1)
+    features -= features.mean(dim=0)
+    basis, values, _ = torch.linalg.svd(features, full_matrices=False)
+    basis = basis[:, values > 1e-9 * values.max()]
     # Under a calibrated posterior the two outcomes have the same variance: u - 1/2 is
     # uniform on an interval of length one, and so is the level.
     outcomes = torch.stack([ranks, (2 * ranks - 1).abs()], dim=1)
-    features = torch.stack([place, place.square()], dim=1)
+    outcomes = outcomes - outcomes.mean(dim=0)
     with seeded(0):
-        return permutation_test(outcomes, features).p_value
-
-
-def _edges(estimates: Tensor) -> Tensor:
-    if not len(estimates):
-        return estimates.new_full((NUM_PARTS - 1,), torch.nan)
-    steps = torch.arange(1, NUM_PARTS, dtype=estimates.dtype) / NUM_PARTS
-    return estimates.quantile(steps)
-
-
-def _listed(shares: Sequence[float]) -> str:
-    *first, last = (f"{share:.0%}" for share in shares)
-    return f"{', '.join(first)} and {last}"
+        orders = [torch.randperm(len(ranks)) for _ in range(NUM_PERMUTATIONS)]
+    # The sum of squares that the regression explains.
+    explained = (basis.T @ outcomes).square().sum()
+    permuted = [
+        (basis.T @ outcomes[rows]).square().sum(dim=(1, 2))
+        for rows in torch.stack(orders).split(100)  # to save memory
+    ]
+    # A permutation that is equal up to rounding counts, and so do the ranks themselves.
+    reached = int((torch.cat(permuted) >= explained * (1 - 1e-12)).sum())
+    return (1 + reached) / (1 + NUM_PERMUTATIONS)

@@ -1,4 +1,4 @@
-"""Weighted means over calibration pairs with their errors, and permutation tests."""
+"""Weighted means over calibration pairs with their errors, and a test of two sets."""
 
 import math
 from collections.abc import Sequence
@@ -13,13 +13,8 @@ from sbi_rope.data.pairs import effective_number, group_means, one_of_each_group
 from sbi_rope.utils.seeds import seeded
 from sbi_rope.utils.tensors import divisors
 
-NUM_PERMUTATIONS = 1000
-# So many are made at a time, which takes memory for as many copies of the outcomes.
-AT_A_TIME = 100
 # Two sets differ clearly if the p-value is below this.
 LEVEL = 0.01
-# Above this there is no sign that they do.
-NO_SIGN = 0.05
 NUM_DIVISIONS = 999
 # With fewer rows in one of the sets, no difference could be significant. The cost
 # grows with the square of the number of rows.
@@ -104,53 +99,6 @@ class Estimate:
     def __str__(self) -> str:
         return format(self, ".3g")
 
-    def __add__(self, number: float) -> "Estimate":
-        return Estimate(self.mean + number, self.low + number, self.high + number)
-
-
-# Whether numbers depend on others -----------------------------------------------------
-
-
-@dataclass(frozen=True, kw_only=True)
-class PermutationTest:
-    """What a linear regression explains, and how often permutations explain as much.
-
-    Attributes:
-        p_value: The share of permutations that explain as much, the data themselves
-            included.
-        explained: The sum of squares that the regression explains.
-        num_features: The number of features that are linearly independent.
-    """
-
-    p_value: float
-    explained: float
-    num_features: int
-
-
-def permutation_test(outcomes: Tensor, features: Tensor) -> PermutationTest:
-    """Test whether rows of outcomes depend linearly on rows of features.
-
-    The statistic is the sum of squares that a linear regression with an intercept
-    explains. If the rows of the outcomes ``(n, l)`` are exchangeable given the features
-    ``(n, p)``, the p-value is below any level at most as often as the level says.
-    """
-    features = features - features.mean(dim=0)
-    vectors, values, _ = torch.linalg.svd(features, full_matrices=False)
-    basis = vectors[:, values > 1e-9 * values.max()]
-    centred = outcomes - outcomes.mean(dim=0)
-    explained = float((basis.T @ centred).square().sum())
-    permuted = []
-    for _ in range(NUM_PERMUTATIONS // AT_A_TIME):
-        rows = torch.stack([torch.randperm(len(centred)) for _ in range(AT_A_TIME)])
-        permuted.append((basis.T @ centred[rows]).square().sum(dim=(1, 2)))
-    # A permutation that is equal up to rounding counts.
-    reached = int((torch.cat(permuted) >= explained * (1 - 1e-12)).sum())
-    return PermutationTest(
-        p_value=(1 + reached) / (1 + NUM_PERMUTATIONS),
-        explained=explained,
-        num_features=basis.shape[1],
-    )
-
 
 # Whether two sets come from one distribution ------------------------------------------
 
@@ -179,11 +127,6 @@ class TwoSampleTest:
     def is_different(self) -> bool:
         """Whether the two sets differ clearly, with a p-value below 0.01."""
         return self.p_value < LEVEL
-
-    def alike(self, names: Sequence[str]) -> tuple[str, ...]:
-        """Return the names of parameters that show no sign of a difference."""
-        both = zip(names, self.p_values, strict=True)
-        return tuple(name for name, p_value in both if p_value > NO_SIGN)
 
     def parameters(self, names: Sequence[str]) -> list[str]:
         """Say which parameters differ by themselves, and how."""

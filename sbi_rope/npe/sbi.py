@@ -584,11 +584,3 @@ class TrainedNPE:
     def readable(self, x: Tensor) -> Tensor:
         """Tell which observations h can read, ``(n,)``; some nets can read NaN."""
         return readable(self.h, x)
-
-
-def squared_mmd(a: Tensor, b: Tensor) -> float:
-    """Return the squared MMD of two sets, Gaussian, of the median width."""
-    # It needs packages that nothing else here needs.
-    from sbi.diagnostics.misspecification import compute_rbf_mmd_median_heuristic
-
-    return float(compute_rbf_mmd_median_heuristic(a, b))

@@ -4,29 +4,22 @@ Every function returns a matplotlib figure and does not show it. matplotlib is i
 when a function is called. Install it with ``pip install sbi-rope[benchmarks]``.
 """
 
-from sbi_rope.plots.diagnosis import implied_parameters
 from sbi_rope.plots.diagnostics import (
     calibration_curves,
     discrepancy,
-    effective_sample_sizes,
     finetuning_history,
-    ranks_by_estimate,
-    real_and_simulated,
+    implied_parameters,
 )
-from sbi_rope.plots.posteriors import overview, pair_plot
-from sbi_rope.plots.sets import credible_set
+from sbi_rope.plots.posteriors import credible_set, overview, pair_plot
 from sbi_rope.plots.stacking import stacking_report
 
 __all__ = [
     "calibration_curves",
     "credible_set",
     "discrepancy",
-    "effective_sample_sizes",
     "finetuning_history",
     "implied_parameters",
     "overview",
     "pair_plot",
-    "ranks_by_estimate",
-    "real_and_simulated",
     "stacking_report",
 ]

@@ -1,15 +1,15 @@
 """Draw posterior samples in a panel: limits of axes, histograms, contours."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 from scipy.stats import gaussian_kde
 from torch import Tensor
 
-from sbi_rope.plots._figures import PRIOR, hide_frame, line_styles
+from sbi_rope.plots._figures import PRIOR, empty_figure, hide_frame, line_styles
 from sbi_rope.utils.settings import names_of
 from sbi_rope.utils.tensors import as_batch
 
@@ -17,11 +17,52 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Samples and a line style by label.
-Styled = dict[str, tuple[Tensor, dict[str, Any]]]
 # Shares that contours enclose, the most samples behind one, and points on its axes.
 SHARES, MAX_SAMPLES, GRID = (0.9, 0.5), 1000, 80
 TRUTH: dict[str, Any] = dict(color="black", lw=1.2, marker="X", ms=8, mec="w", zorder=5)
+
+
+class Posteriors(NamedTuple):
+    """Samples and line styles by label, and what is drawn with them.
+
+    ``limits`` of axes, and ``prior``, the central 99 % of the prior, are ``(2, d)``.
+    """
+
+    draws: dict[str, tuple[Tensor, dict[str, Any]]]
+    truth: Tensor | None
+    names: list[str]
+    limits: Tensor
+    prior: Tensor | None
+
+
+def as_posteriors(
+    samples: Mapping[str, Tensor],
+    theta: Tensor | None,
+    parameter_names: Sequence[str] | None,
+    prior: Tensor | None,
+) -> Posteriors:
+    """Return what a user wants to draw. Labels say if many samples are outside."""
+    draws, truth, names = as_samples(samples, theta, parameter_names)
+    spans = torch.stack([central_interval(value) for value in draws.values()])
+    if prior is not None:
+        prior = central_interval(as_drawn("prior", prior, (len(names),)))
+        width = prior[1] - prior[0]
+        floor, ceiling = prior[0] - width, prior[1] + width
+        is_near = (spans[:, :1] <= ceiling) & (spans[:, 1:] >= floor)
+        spans = spans.clamp(floor, ceiling).where(is_near, prior)
+        spans = torch.cat([spans, prior[None]])
+    if truth is not None:
+        spans = torch.cat([spans, truth.expand(1, 2, -1)])
+    limits = with_margin(spans[:, 0].amin(dim=0), spans[:, 1].amax(dim=0))
+    found = {}
+    for name, style in line_styles(draws).items():
+        is_inside = (draws[name] >= limits[0]) & (draws[name] <= limits[1])
+        outside = 1.0 - float(is_inside.all(dim=1).double().mean())
+        # The axes are made to leave out one sample in a hundred of each parameter.
+        is_large = outside > 0.05 + 0.01 * len(names)
+        label = f"{name} ({100 * outside:.0f} % outside)" if is_large else name
+        found[label] = draws[name], style
+    return Posteriors(found, truth, names, limits, prior)
 
 
 def as_samples(
@@ -60,22 +101,6 @@ def with_margin(low: Tensor, high: Tensor) -> Tensor:
     return torch.stack([low - margin, high + margin])
 
 
-def limits_of(
-    draws: Iterable[Tensor], truth: Tensor | None, prior: Tensor | None
-) -> Tensor:
-    """Return limits that hold truth, prior and samples, as ``pair_plot`` says."""
-    spans = torch.stack([central_interval(value) for value in draws])
-    if prior is not None:
-        width = prior[1] - prior[0]
-        floor, ceiling = prior[0] - width, prior[1] + width
-        is_near = (spans[:, :1] <= ceiling) & (spans[:, 1:] >= floor)
-        spans = spans.clamp(floor, ceiling).where(is_near, prior)
-        spans = torch.cat([spans, prior[None]])
-    if truth is not None:
-        spans = torch.cat([spans, truth.expand(1, 2, -1)])
-    return with_margin(spans[:, 0].amin(dim=0), spans[:, 1].amax(dim=0))
-
-
 def set_up_panel(
     axes: "Axes",
     names: Sequence[str],
@@ -99,55 +124,38 @@ def set_up_panel(
 
 
 def corner_panels(
-    figure: "Figure", names: Sequence[str], limits: Tensor, truth: Tensor | None
-) -> Iterator[tuple["Axes", list[int]]]:
-    """Add a panel for each parameter and each pair, and yield it and which it shows."""
-    dim = len(names)
+    names: Sequence[str], limits: Tensor, truth: Tensor | None
+) -> "tuple[Figure, list[tuple[Axes, list[int]]]]":
+    """Return a figure with a panel for each parameter and pair, and what they show."""
+    dim, panels = len(names), []
+    figure = empty_figure(2.0 * dim + 0.8, 2.0 * dim + 1.0)
     for row in range(dim):
         for column in range(row + 1):
             shown = [row] if row == column else [column, row]
             axes = figure.add_subplot(dim, dim, row * dim + column + 1)
             set_up_panel(axes, names, limits, truth, shown)
             axes.label_outer()
-            yield axes, shown
+            panels.append((axes, shown))
+    return figure, panels
 
 
-def corner_legend(figure: "Figure", handles: list[Any], truth: Tensor | None) -> None:
+def corner_legend(figure: "Figure", handles: list[Any]) -> None:
     """Add a legend in the empty half of the figure, or above a single panel."""
-    from matplotlib.lines import Line2D
-
-    if truth is not None:
-        handles = [*handles, Line2D([], [], label="truth", **TRUTH)]
     place = "upper right" if len(figure.axes) > 1 else "outside upper center"
     figure.legend(handles=handles, loc=place, frameon=False)
 
 
-def styled(draws: Mapping[str, Tensor], limits: Tensor) -> Styled:
-    """Return samples and line styles by label, which says if many are outside."""
-    found = {}
-    for name, style in line_styles(draws).items():
-        is_inside = (draws[name] >= limits[0]) & (draws[name] <= limits[1])
-        outside = 1.0 - float(is_inside.all(dim=1).double().mean())
-        # The axes are made to leave out one sample in a hundred of each parameter.
-        is_large = outside > 0.05 + 0.01 * limits.shape[1]
-        label = f"{name} ({100 * outside:.0f} % outside)" if is_large else name
-        found[label] = draws[name], style
-    return found
-
-
-def draw_posteriors(
-    axes: "Axes", draws: Styled, prior: Tensor | None, shown: list[int]
-) -> None:
+def draw_posteriors(axes: "Axes", posteriors: Posteriors, shown: list[int]) -> None:
     """Draw one or two parameters of posteriors on the shaded interval of the prior."""
-    for label, (values, style) in draws.items():
+    for label, (values, style) in posteriors.draws.items():
         axes.plot([], [], label=label, **style)  # for the legend
         if len(shown) == 1:
             draw_marginal(axes, values[:, shown[0]], style)
         else:
             draw_contours(axes, values[:, shown], style)
-    if prior is not None:
+    if posteriors.prior is not None:
         shade = {"color": PRIOR, "lw": 0, "zorder": 0, "label": "prior"}
-        sides, *ends = prior[:, shown].T.tolist()
+        sides, *ends = posteriors.prior[:, shown].T.tolist()
         if ends:
             axes.fill_between(sides, *ends[0], **shade)
         else:

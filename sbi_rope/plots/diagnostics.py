@@ -1,20 +1,18 @@
-"""Pictures of discrepancies, calibration, fine-tuning and couplings."""
+"""Pictures of discrepancies, calibration, diagnoses and fine-tuning."""
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from sbi_rope.coupling import Coupling
+from sbi_rope.diagnosis import Diagnosis
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.metrics import Evaluation
-from sbi_rope.metrics.evaluation import LEVEL, NOMINAL
+from sbi_rope.metrics.evaluation import NOMINAL
 from sbi_rope.plots._figures import (
     BLUE,
     GREY,
-    SKY,
     VERMILLION,
     add_legend_above,
     draw_calibrated_band,
@@ -24,50 +22,15 @@ from sbi_rope.plots._figures import (
     new_figure,
     panel_grid,
 )
-from sbi_rope.plots._samples import as_drawn, central_interval
+from sbi_rope.plots._samples import central_interval, with_margin
 from sbi_rope.rope.finetuning import History
-from sbi_rope.utils.settings import names_of
+from sbi_rope.utils.settings import check
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# The most parameters, series and summaries that are drawn.
-MAX_PANELS, MAX_SUMMARIES = 6, 20
-
-
-def real_and_simulated(
-    x_o: Tensor, x_s: Tensor, *, x_names: Sequence[str] | None = None
-) -> "Figure":
-    """Draw real observations in blue, and simulations with the same parameters.
-
-    Args:
-        x_o: Real observations, shape ``(n, l)``.
-        x_s: Simulations with the parameters of the real observations, same shape.
-        x_names: A name for each of the l entries, of which a histogram of their central
-            99 % is drawn. If None, the first six observations are drawn as series.
-
-    Returns:
-        The figure.
-    """
-    x_o = as_drawn("x_o", x_o, np.shape(x_o)[-1:])
-    x_s = as_drawn("x_s", x_s, x_o.shape[1:], rows=len(x_o))
-    if x_names is None:
-        count = min(len(x_o), MAX_PANELS)
-        figure, panels = panel_grid(count, columns=3, width=3.2, height=2.2)
-        for axes, real, simulated in zip(panels, x_o, x_s, strict=False):
-            axes.plot(simulated, color=VERMILLION, lw=1.2, label="simulated")
-            axes.plot(real, color=BLUE, lw=1.2, label="real")
-    else:
-        figure, panels = panel_grid(len(x_names), columns=4, width=2.6, height=2.4)
-        ends = central_interval(torch.cat([x_o, x_s])).T.tolist()
-        style = {"bins": 40, "density": True, "histtype": "stepfilled", "alpha": 0.45}
-        for k, (axes, name) in enumerate(zip(panels, x_names, strict=True)):
-            style["range"] = ends[k]
-            axes.hist(x_s[:, k], color=VERMILLION, label="simulated", **style)
-            axes.hist(x_o[:, k], color=BLUE, label="real", **style)
-            axes.set(xlabel=name, yticks=[])
-    add_legend_above(figure, panels[0])
-    return figure
+# The most summaries that are drawn.
+MAX_SUMMARIES = 20
 
 
 def discrepancy(report: DiscrepancyReport) -> "Figure":
@@ -155,45 +118,47 @@ def calibration_curves(evaluations: Mapping[str, Evaluation]) -> "Figure":
     return figure
 
 
-def ranks_by_estimate(
-    evaluation: Evaluation, *, parameter_names: Sequence[str] | None = None
-) -> "Figure":
-    r"""Draw the ranks of true parameters against the posterior means.
+def implied_parameters(diagnosis: Diagnosis) -> "Figure":
+    """Draw the prior, and histograms of the parameters that a batch implies.
 
-    A rank of 0 is below all samples of the posterior, and one of 1 above all. If the
-    posterior is calibrated, ranks are spread evenly over the whole height, whatever the
-    estimate is. Parameters in the grey bands are outside their intervals. Lines divide
-    the thirds of the estimates, and the share inside the intervals is written above
-    each. There is a panel for each of the first six parameters.
+    The parameters that the batch implies are those of the simulations that it is
+    coupled with. A dashed histogram shows the same for a batch that follows the prior.
+    It differs from the prior because a coupling blurs.
 
     Args:
-        evaluation: The scores of a posterior, or ``posterior.report.held_out`` of a
-            stack.
-        parameter_names: A name for each parameter; those of the evaluation if None.
+        diagnosis: What :func:`sbi_rope.diagnose` returns.
 
     Returns:
-        The figure.
+        The figure, with one panel for each parameter.
     """
-    names = parameter_names or evaluation.names
-    names = names_of(names, len(evaluation.names))[:MAX_PANELS]
-    estimates, ranks = evaluation.estimates.cpu(), evaluation.ranks.cpu()
-    found, tail, count = evaluation.dependence, (1 - LEVEL) / 2, len(names)
-    figure, panels = panel_grid(count, columns=3, width=3.2, height=2.8, sharey=True)
+    check("diagnosis", diagnosis, Diagnosis)
+    names = diagnosis.parameter_names
+    figure, panels = panel_grid(len(names), columns=4, width=3.4, height=2.7)
+    figure.set_figheight(figure.get_figheight() + 0.5)
+    lines: dict[str, dict[str, Any]] = {
+        "implied by a batch of the prior": {"color": GREY, "ls": "--"},
+        "implied by this batch": {"color": BLUE},
+    }
     for k, (axes, name) in enumerate(zip(panels, names, strict=True)):
-        axes.axhspan(0.0, tail, color="0.88", lw=0)
-        axes.axhspan(1 - tail, 1.0, color="0.88", lw=0)
-        axes.plot(estimates[:, k], ranks[:, k], "o", color=BLUE, ms=3.5)
-        left, right = axes.get_xlim()
-        axes.set(xlim=(left, right), ylim=(0, 1), xlabel=f"estimate of {name}")
-        if k % 3 == 0:
-            axes.set_ylabel("rank of the true parameter")
-        low, high = found.edges[k].tolist()
-        if low != low:  # NaN, as the parameter is not known anywhere
-            continue
-        axes.vlines([low, high], 0, 1, color=GREY, lw=0.8)
-        centres = ((left + low) / 2, (low + high) / 2, (high + right) / 2)
-        for x, share in zip(centres, found.shares[k].tolist(), strict=True):
-            axes.text(x, 1.03, f"{share:.0%}", ha="center", size=9)
+        theta, prior = diagnosis.theta[:, k], diagnosis.prior[:, k]
+        whole = torch.stack([prior.min(), prior.max()])
+        ends = central_interval(prior[:, None])[:, 0]
+        # A prior without tails is shown as a whole.
+        if whole[1] - whole[0] < 1.1 * (ends[1] - ends[0]):
+            ends = whole
+        low, high = ends.tolist()
+        axes.set(xlim=with_margin(ends[:1], ends[1:])[:, 0].tolist(), xlabel=name)
+        axes.set_yticks([])
+        options: dict[str, Any] = {"bins": np.linspace(low, high, 21), "density": True}
+        # The outermost bins hold the tails, so that nothing is cut off.
+        axes.hist(prior.clamp(low, high), color="0.85", label="prior", **options)
+        weights = diagnosis.unshifted, diagnosis.implied
+        options |= {"histtype": "step", "lw": 1.6}
+        for (label, style), weight in zip(lines.items(), weights, strict=True):
+            values = theta.clamp(low, high)
+            axes.hist(values, weights=weight, label=label, **style, **options)
+    panels[0].set_ylabel("density")
+    add_legend_above(figure, panels[0])
     return figure
 
 
@@ -221,32 +186,4 @@ def finetuning_history(history: History) -> "Figure":
     axes.locator_params("x", integer=True)
     axes.set_ylabel("mean distance to the target\n(units of the embedding)")
     axes.legend(frameon=False)
-    return figure
-
-
-def effective_sample_sizes(coupling: Coupling) -> "Figure":
-    r"""Draw how many simulations contribute to the posterior of each observation.
-
-    The effective sample size of observation :math:`i` is
-    :math:`1 / \sum_j \alpha_{ij}^2`. It is 1 if a single simulation has all the weight,
-    and the number of simulations :math:`n_s` if all have the same weight. A line marks
-    :math:`n_s`.
-
-    Args:
-        coupling: A coupling of observations to simulations, ``posterior.coupling``.
-
-    Returns:
-        The figure, a histogram on a logarithmic axis.
-    """
-    sizes = coupling.effective_sample_size.detach().cpu().double()
-    n_s, median = len(coupling.simulated), float(sizes.median())
-    figure, axes = new_figure(6.0, 3.6)
-    edges = np.geomspace(1, max(n_s, 2), 41).tolist()
-    axes.hist(sizes.clamp(edges[0], edges[-1]), bins=edges, color=SKY)
-    axes.axvline(median, color=BLUE, lw=1.8, label=f"median: {median:.3g} simulations")
-    label = f"all equal: $n_s$ = {n_s}"
-    axes.axvline(n_s, color="black", ls="--", lw=1.2, label=label)
-    axes.set(xscale="log", xlabel="effective sample size (simulations)")
-    axes.set_ylabel(f"observations (of {len(sizes)})")
-    axes.legend(frameon=False, loc="upper left")
     return figure

@@ -1,4 +1,4 @@
-"""Posteriors of one observation, and how RoPE makes one."""
+"""Posteriors and credible sets of one observation, and how RoPE makes a posterior."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -7,20 +7,31 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_rope.plots._figures import BLUE, VERMILLION, empty_figure, hide_frame
+from sbi_rope.density import MixturePosterior
+from sbi_rope.plots._figures import (
+    BLUE,
+    GREY,
+    ORANGE,
+    VERMILLION,
+    empty_figure,
+    hide_frame,
+)
 from sbi_rope.plots._samples import (
+    TRUTH,
     as_drawn,
+    as_posteriors,
     as_samples,
     central_interval,
     corner_legend,
     corner_panels,
     draw_contours,
+    draw_marginal,
     draw_posteriors,
-    limits_of,
     set_up_panel,
-    styled,
     with_margin,
 )
+from sbi_rope.stacking import StackedPosterior
+from sbi_rope.utils.errors import InvalidInputError, warn_user
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,6 +43,10 @@ ARROW = {"arrowstyle": "-|>", "color": "black", "lw": 1.6}
 # The most simulations and observations that are drawn. More would run together.
 MAX_SIMULATED, MAX_REAL = 1000, 250
 TITLE: dict[str, Any] = {"loc": "left", "fontsize": 11}
+SETS: dict[str, dict[str, Any]] = {
+    "of the posterior": {"color": BLUE, "ls": "-", "marker": "o", "ms": 4},
+    "guaranteed": {"color": ORANGE, "ls": "--", "marker": "o", "ms": 4},
+}
 
 
 def pair_plot(
@@ -56,14 +71,75 @@ def pair_plot(
     Returns:
         The figure, with d rows and columns and the marginals on the diagonal.
     """
-    draws, truth, names = as_samples(samples, theta, parameter_names)
-    interval = _interval(prior, len(names))
-    limits = limits_of(draws.values(), truth, interval)
-    figure = empty_figure(2.0 * len(names) + 0.8, 2.0 * len(names) + 1.0)
-    posteriors = styled(draws, limits)
-    for axes, shown in corner_panels(figure, names, limits, truth):
-        draw_posteriors(axes, posteriors, interval, shown)
-    corner_legend(figure, figure.axes[0].get_legend_handles_labels()[0], None)
+    posteriors = as_posteriors(samples, theta, parameter_names, prior)
+    names, limits, truth = posteriors.names, posteriors.limits, posteriors.truth
+    figure, panels = corner_panels(names, limits, truth)
+    for axes, shown in panels:
+        draw_posteriors(axes, posteriors, shown)
+    corner_legend(figure, panels[0][0].get_legend_handles_labels()[0])
+    return figure
+
+
+def credible_set(
+    posterior: MixturePosterior,
+    x: Tensor | None = None,
+    theta: Tensor | None = None,
+    *,
+    level: float = 0.9,
+    parameter_names: Sequence[str] | None = None,
+) -> "Figure":
+    """Draw the credible set of an observation, and of a stack that with a guarantee.
+
+    The panels of pairs show parameters that are in the sets, the smaller set on the
+    larger one. With three parameters or more, a panel shows the shadow of a set. The
+    diagonal shows the intervals of each parameter, and draws of the posterior as a
+    histogram. A set that a stack cannot guarantee is left out, with a warning.
+
+    Args:
+        posterior: A posterior of this package.
+        x: An observation; the default x if None.
+        theta: The true parameter, shape ``(d,)``, which is marked in black.
+        level: The level of the sets and intervals.
+        parameter_names: A label for each parameter; those of ``RoPE`` if None.
+    """
+    x = posterior._one_x(x)[0]
+    found = {}
+    for name in list(SETS)[: 1 + isinstance(posterior, StackedPosterior)]:
+        options: dict[str, Any] = {"guaranteed": bool(found), "num_samples": 2000}
+        makers = posterior.credible_set, posterior.credible_intervals
+        try:
+            found[name] = [make(level, x, seed=0, **options) for make in makers]
+        except InvalidInputError as error:
+            if not found:
+                raise
+            warn_user(f"No set with a guarantee is drawn. {error}")
+    points = torch.cat([one.draws for one, _ in found.values()])
+    samples = {name: points[one.contains(points)] for name, (one, _) in found.items()}
+    samples["posterior"] = next(iter(found.values()))[0].draws
+    names = posterior.parameter_names if parameter_names is None else parameter_names
+    members, truth, labels = as_samples(samples, theta, names)
+    draws = members.pop("posterior")
+    ends = {name: torch.stack([b.low, b.high]) for name, (_, b) in found.items()}
+    shown = [central_interval(draws), *members.values(), *ends.values()]
+    shown += [] if truth is None else [truth[None]]
+    shown = torch.cat([one.to(draws) for one in shown]).nan_to_num(posinf=0, neginf=0)
+    limits = with_margin(shown.amin(dim=0), shown.amax(dim=0))
+    figure, panels = corner_panels(labels, limits, truth)
+    for axes, pair in panels:
+        if len(pair) == 1:
+            draw_marginal(axes, draws[:, pair[0]], {"color": GREY})
+            for name, end in ends.items():
+                for value in end[:, pair[0]].tolist():
+                    axes.axvline(value, **SETS[name], lw=1.8, markevery=[])
+            continue
+        for name in sorted(found, key=lambda name: -found[name][0].volume):
+            colour, columns = SETS[name]["color"], members[name][:, pair].T.numpy()
+            axes.scatter(*columns, s=5, color=colour, lw=0, rasterized=True)
+    from matplotlib.lines import Line2D
+
+    styles = {f"{100 * level:.4g} %, {name}": SETS[name] for name in found}
+    styles |= {} if truth is None else {"truth": TRUTH}
+    corner_legend(figure, [Line2D([], [], label=k, **v) for k, v in styles.items()])
     return figure
 
 
@@ -112,9 +188,7 @@ def overview(
         as_drawn("after", after, width),
     )
     weights = as_drawn("weights", weights, (), rows=len(simulated))
-    draws, truth, names = as_samples(samples, theta, parameter_names)
-    interval = _interval(prior, len(names))
-    limits = limits_of(draws.values(), truth, interval)
+    posteriors = as_posteriors(samples, theta, parameter_names, prior)
     figure = empty_figure(9.6, 3.9)
     tune, couple, mix = figure.subplots(1, 3)
 
@@ -143,9 +217,10 @@ def overview(
     label = f"its {count:.0f} or so simulations"
     couple.plot([], [], "o", color=BLUE, mew=0, label=label)
 
+    names, limits, truth = posteriors.names, posteriors.limits, posteriors.truth
     shown = list(range(len(names)))[:2]
     set_up_panel(mix, names, limits, truth, shown)
-    draw_posteriors(mix, styled(draws, limits), interval, shown)
+    draw_posteriors(mix, posteriors, shown)
     # The legends are below the panels, because points can be in any corner inside.
     style = {"frameon": False, "loc": "upper center"}
     tune.legend(**style, bbox_to_anchor=(0.5, -0.08), markerscale=2)
@@ -155,10 +230,6 @@ def overview(
     couple.set_title("2.  Couple: weigh simulations\n     for each", **TITLE)
     mix.set_title("3.  Mix: average\n     their posteriors", **TITLE)
     return figure
-
-
-def _interval(prior: Tensor | None, dim: int) -> Tensor | None:
-    return None if prior is None else central_interval(as_drawn("prior", prior, (dim,)))
 
 
 def _in_plane(simulated: Tensor, *others: Tensor) -> list[Tensor]:

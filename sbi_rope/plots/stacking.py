@@ -4,6 +4,8 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+import torch
+
 from sbi_rope.metrics import Estimate
 from sbi_rope.metrics.evaluation import NOMINAL
 from sbi_rope.plots._figures import (
@@ -22,20 +24,18 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# The most candidates that are drawn.
-MAX_CANDIDATES = 12
 # How far the axis of scores reaches below the best, in distances of the median to it.
 REACH = 4.0
-SMALL = 10
+SMALL, UNIT = 10, "nats a pair, theta in its own units"
 
 
 def stacking_report(report: StackingReport) -> "Figure":
     """Draw out-of-fold scores and weights of candidates, and coverage of the stack.
 
-    The first panel shows the mean log density of hold-out pairs under the best
-    candidates and the stack, with 95 % intervals. The stack is corrected for mass
-    outside the prior; where this matters, it is shown without correction, too, because
-    the candidates are not corrected. Scores far below the others are written beside an
+    The first panel shows the mean log density of hold-out pairs under the candidates
+    and the stack, with 95 % intervals. The stack is corrected for mass outside the
+    prior; where this matters, it is shown without correction, too, because the
+    candidates are not corrected. Scores far below the others are written beside an
     arrow. The second panel shows the weights. In the third, at each level the band
     holds 95 % of the coverage curves of calibrated posteriors. A learning curve is in a
     fourth panel, if there is one.
@@ -47,9 +47,8 @@ def stacking_report(report: StackingReport) -> "Figure":
         The figure.
     """
     check("report", report, StackingReport)
-    curve, rows = report.learning_curve, report.as_rows()
-    shown = rows[:MAX_CANDIDATES][::-1]
-    top = max(1.2 + 0.28 * len(shown), 3.2)
+    curve, rows = report.learning_curve, report.as_rows()[::-1]
+    top = max(1.2 + 0.28 * len(rows), 3.2)
     if curve is None:
         figure = empty_figure(9.4, top)
         grid = figure.add_gridspec(1, 3, width_ratios=[1.5, 0.8, 1.2])
@@ -63,18 +62,19 @@ def stacking_report(report: StackingReport) -> "Figure":
         places = [below[0], below[1]]
     scores = figure.add_subplot(grid[0, 0])
     weights = figure.add_subplot(grid[0, 1], sharey=scores)
-    _draw_scores(scores, report, shown)
-    bars = weights.barh(
-        range(len(shown)), [row["weight"] for row in shown], color=ORANGE
-    )
-    texts = [f"{row['weight']:.0%}" for row in shown]
+    _draw_scores(scores, report, rows)
+    shares = [row["weight"] for row in rows]
+    bars = weights.barh(range(len(rows)), shares, color=ORANGE)
+    texts = [f"{share:.0%}" for share in shares]
     weights.bar_label(bars, texts, padding=3, fontsize=SMALL)
     weights.tick_params(axis="y", length=0, labelleft=False)
-    others = sum(row["weight"] for row in rows[MAX_CANDIDATES:])
-    note = f"\n({others:.0%} on those not shown)" if rows[MAX_CANDIDATES:] else ""
-    weights.set_xlim(0, 1.35 * max(row["weight"] for row in shown))
-    weights.set_xlabel(f"weight in the stack{note}", fontsize=SMALL)
-    _draw_coverage(figure.add_subplot(places[0]), report)
+    weights.set_xlim(0, 1.35 * max(shares))
+    weights.set_xlabel("weight in the stack", fontsize=SMALL)
+    coverage = figure.add_subplot(places[0])
+    draw_calibrated_band(coverage, round(report.held_out.num_independent))
+    coverage.set_box_aspect(None)  # as high as the panels beside it
+    coverage.plot(NOMINAL, report.held_out.coverage.nanmean(dim=1).cpu(), color=BLUE)
+    coverage.set(xlabel="credible level", ylabel="share of hold-out pairs inside")
     if curve is not None:
         _draw_learning_curve(figure.add_subplot(places[1]), curve)
     for axes in figure.axes:
@@ -83,11 +83,11 @@ def stacking_report(report: StackingReport) -> "Figure":
 
 
 def _draw_scores(
-    axes: "Axes", report: StackingReport, shown: Sequence[dict[str, Any]]
+    axes: "Axes", report: StackingReport, rows: Sequence[dict[str, Any]]
 ) -> None:
     found = {
         row["candidate"]: Estimate(row["score"], row["score_low"], row["score_high"])
-        for row in shown
+        for row in rows
     }
     floor = _floor([one.mean for one in found.values()])
     # Arrows are at the edge: no interval of the others reaches beyond them.
@@ -99,14 +99,8 @@ def _draw_scores(
             continue
         axes.plot(edge, position, "<", color=SKY, markersize=7)
         text = f"{one.mean:.0f}" if math.isfinite(one.mean) else "zero density"
-        axes.annotate(
-            text,
-            (edge, position),
-            xytext=(8, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=SMALL,
-        )
+        beside: dict[str, Any] = {"xytext": (8, 0), "textcoords": "offset points"}
+        axes.annotate(text, (edge, position), va="center", fontsize=SMALL, **beside)
     stacks = {"stack": report.held_out.lpp}
     if is_corrected(report):
         # It is below the other, beside the candidates that it is compared with.
@@ -114,21 +108,11 @@ def _draw_scores(
         stacks = {"stack, uncorrected": uncorrected, **stacks}
     for position, (name, one) in enumerate(stacks.items(), start=len(found)):
         face = BLUE if name == "stack" else "white"
-        style: dict[str, Any] = {
-            "fmt": "*",
-            "color": BLUE,
-            "markerfacecolor": face,
-            "markersize": 11,
-        }
-        _draw_estimate(axes, position, one, **style)
+        style = {"color": BLUE, "markerfacecolor": face, "markersize": 11}
+        _draw_estimate(axes, position, one, fmt="*", **style)
     names = [*found, *stacks]
     axes.set_yticks(range(len(names)), names, fontsize=SMALL)
-    left_out = len(report.names) - len(shown)
-    note = f" ({left_out} lower ones not shown)" if left_out else ""
-    axes.set_xlabel(
-        f"log density of hold-out pairs{note},\nnats a pair, theta in its own units",
-        fontsize=SMALL,
-    )
+    axes.set_xlabel(f"log density of hold-out pairs,\n{UNIT}", fontsize=SMALL)
 
 
 def _draw_estimate(axes: "Axes", position: int, one: Estimate, **style: Any) -> None:
@@ -147,29 +131,14 @@ def _floor(scores: Sequence[float]) -> float:
     return best - max(REACH * (best - middle), 1.0)
 
 
-def _draw_coverage(axes: "Axes", report: StackingReport) -> None:
-    draw_calibrated_band(axes, round(report.held_out.num_independent))
-    axes.set_box_aspect(None)  # as high as the panels beside it
-    axes.plot(NOMINAL, report.held_out.coverage.nanmean(dim=1).cpu(), color=BLUE)
-    axes.set(xlabel="credible level", ylabel="share of hold-out pairs inside")
-
-
 def _draw_learning_curve(axes: "Axes", curve: LearningCurve) -> None:
-    scores = curve.scores
-    ends = [[one.mean - one.low for one in scores]]
-    ends.append([one.high - one.mean for one in scores])
-    axes.errorbar(
-        curve.num_pairs,
-        [one.mean for one in scores],
-        yerr=ends,
-        fmt="o-",
-        color=BLUE,
-        capsize=3,
-    )
+    means, low, high = torch.tensor([[*vars(one).values()] for one in curve.scores]).T
+    style: dict[str, Any] = {"fmt": "o-", "color": BLUE, "capsize": 3}
+    axes.errorbar(curve.num_pairs, means, yerr=[means - low, high - means], **style)
     axes.set(
         xscale="log",
         xlabel="pairs trained on",
-        ylabel="log density of hold-out pairs,\nnats a pair, theta in its own units",
+        ylabel=f"log density of hold-out pairs,\n{UNIT}",
     )
     axes.set_xticks(curve.num_pairs, [str(n) for n in curve.num_pairs])
     axes.minorticks_off()

@@ -2,7 +2,7 @@
 
 import base64
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib import metadata
 from os import PathLike
@@ -10,34 +10,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sbi_rope.diagnosis import Diagnosis
-from sbi_rope.plots import (
-    discrepancy,
-    implied_parameters,
-    ranks_by_estimate,
-    stacking_report,
-)
+from sbi_rope.plots import discrepancy, implied_parameters, stacking_report
 from sbi_rope.stacking import StackingReport
 from sbi_rope.stacking.sections import METHODS, headline, sections_of
-from sbi_rope.utils.errors import InvalidInputError
 from sbi_rope.utils.settings import check, names_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# A page of this package is recognised by this.
-GENERATOR = '<meta name="generator" content="sbi_rope'
-DPI = 130
-
 
 @dataclass
 class _Part:
-    """A section of the page: sentences, a table, and pictures with captions."""
+    """A section of the page: sentences, a table, and a picture with its caption."""
 
     title: str
     lines: Sequence[tuple[str, bool]] = ()
     heads: Sequence[str] = ()
     rows: Sequence[Sequence[str]] = ()
-    pictures: Sequence[tuple[str, str]] = ()
+    picture: tuple[str, str] | None = None
 
 
 def write_html(
@@ -55,8 +45,7 @@ def write_html(
 
     Args:
         report: The ``report`` of the posterior that :func:`sbi_rope.stack` returned.
-        path: The file. Its folder is made if there is none. A report of this package
-            that is there already is replaced, and no other file.
+        path: The file, which is replaced. Its folder is made if there is none.
         diagnosis: What :func:`sbi_rope.diagnose` says about a batch, if the report
             should hold it.
         parameter_names: A name for each parameter. If None, those that ``RoPE`` was
@@ -64,30 +53,23 @@ def write_html(
         x_names: A name for each entry of x; "x[0]" and so on if None.
 
     Raises:
-        InvalidInputError: If the names do not fit, or the path is a folder or a file of
-            something else.
+        InvalidInputError: If the names do not fit.
     """
     check("report", report, StackingReport)
     check("diagnosis", diagnosis, Diagnosis | None)
-    path = Path(path).expanduser()
-    if path.exists() and not (path.is_file() and GENERATOR in _start(path)):
-        raise InvalidInputError(
-            "Expected `path` to be a new file or an earlier report, which is replaced; "
-            f"got {path}."
-        )
-    names = report.held_out.names
     if parameter_names is not None:
-        names = names_of(parameter_names, len(names))
-    if x_names is not None:
-        if report.discrepancy is None:
-            raise InvalidInputError(
-                "Expected no `x_names`, because this report does not compare the "
-                f"entries of x; got {list(x_names)}."
-            )
+        names = names_of(parameter_names, len(report.held_out.names))
+        held_out = replace(report.held_out, parameter_names=names)
+        report = replace(report, held_out=held_out)
+    if x_names is not None and report.discrepancy is not None:
         report = replace(report, discrepancy=report.discrepancy.renamed(x_names))
-    parts = list(_parts(report, names))
+    parts = list(_parts(report))
     if diagnosis is not None:
-        parts.append(_of_diagnosis(diagnosis))
+        found = diagnosis.findings
+        lines = [(f"{one.name}: {one.sentence}", one.alarming) for one in found]
+        caption = "The parameters that the batch implies, beside the prior."
+        picture = _encoded(implied_parameters(diagnosis)), caption
+        parts.append(_Part("Diagnosis of the batch", lines, picture=picture))
     parts.append(_Part("How it was made", rows=list(report.provenance.items())))
     from jinja2 import Environment, PackageLoader
 
@@ -103,14 +85,15 @@ def write_html(
         headline=headline(report),
         sections=parts,
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8")
+    file = Path(path).expanduser()
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(text, encoding="utf-8")
 
 
-def _parts(report: StackingReport, names: Sequence[str]) -> Iterable[_Part]:
+def _parts(report: StackingReport) -> Iterator[_Part]:
     """Yield the sections of the printed report, with their tables and pictures."""
     helped, trust, simulator, more = (
-        _Part(one.title, one.lines) for one in sections_of(report, names)
+        _Part(one.title, one.lines) for one in sections_of(report)
     )
     helped.heads = "candidate", "method", "weight", "nats a pair", "in prior units"
     helped.rows = [
@@ -128,17 +111,8 @@ def _parts(report: StackingReport, names: Sequence[str]) -> Iterable[_Part]:
         "of known parameters inside intervals of each level; the band holds 95 % of "
         "the curves of calibrated posteriors."
     )
-    helped.pictures = [(_encoded(stacking_report(report)), caption)]
+    helped.picture = _encoded(stacking_report(report)), caption
     yield helped
-    held_out = report.held_out
-    if any(held_out.dependence.found):
-        caption = (
-            "The rank of each known parameter among samples of its posterior, from 0 "
-            "(below all) to 1 (above all). Points are spread evenly if intervals are "
-            "right everywhere; those in grey bands are outside 90 % intervals."
-        )
-        figure = ranks_by_estimate(held_out, parameter_names=names)
-        trust.pictures = [(_encoded(figure), caption)]
     yield trust
     if (found := report.discrepancy) is not None:
         simulator.heads = "entry", "size", "shift", "gain", "error", "no discrepancy"
@@ -154,24 +128,12 @@ def _parts(report: StackingReport, names: Sequence[str]) -> Iterable[_Part]:
             "alone, with 95 % intervals. The size is in standard deviations of "
             "simulations; the last column is the probability of no discrepancy."
         )
-        simulator.pictures = [(_encoded(discrepancy(found)), caption)]
+        simulator.picture = _encoded(discrepancy(found)), caption
     yield simulator
     yield more
 
 
-def _of_diagnosis(diagnosis: Diagnosis) -> _Part:
-    lines = [(f"{one.name}: {one.sentence}", one.alarming) for one in diagnosis.ordered]
-    picture = _encoded(implied_parameters(diagnosis))
-    caption = "The parameters that the batch implies, beside the prior."
-    return _Part("Diagnosis of the batch", lines, pictures=[(picture, caption)])
-
-
 def _encoded(figure: "Figure") -> str:
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
+    figure.savefig(buffer, format="png", dpi=130, metadata={"Software": None})
     return base64.b64encode(buffer.getvalue()).decode("ascii")
-
-
-def _start(path: Path) -> str:
-    with path.open("rb") as file:
-        return file.read(1000).decode("utf-8", errors="replace")

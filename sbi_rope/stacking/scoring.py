@@ -14,7 +14,6 @@ from sbi_rope.density import Density, Mixture, MixturePosterior
 from sbi_rope.density.base import without_nan
 from sbi_rope.density.sets import SetScores, joint_scores, marginal_scores
 from sbi_rope.metrics import Evaluation, draw_samples
-from sbi_rope.metrics.calls import draw_chunks
 from sbi_rope.metrics.evaluation import estimates_and_ranks
 from sbi_rope.stacking.candidates import Candidate
 from sbi_rope.stacking.data import StackData
@@ -189,15 +188,8 @@ def _score_exact(
     """Score the posterior of a fold at labels that are exact."""
     log_prob, joint, marginal, found = [], [], [], []
     with seeded(seed):
-        chunks = draw_chunks(
-            posterior,
-            theta,
-            x,
-            num_samples=NUM_SAMPLES,
-            chunk_size=MAX_OBSERVATIONS,
-            show=False,
-        )
-        for rows, draws in chunks:
+        for rows in torch.arange(len(x)).split(MAX_OBSERVATIONS):
+            draws = draw_samples(posterior, x[rows], num_samples=NUM_SAMPLES)
             # In one call, because the mass inside the support is estimated in each.
             log_probs = posterior.log_prob_batched(
                 torch.cat([theta[rows][None], draws]), x[rows]

@@ -172,7 +172,7 @@ def _trust(
     known = "labels" if report.score_errors is not None else "parameters"
     if held_out.ranks.isnan().all():
         return [("Coverage is not known for labels that are given as draws.", False)]
-    lines = held_out.lines(known=known, names=names)
+    lines = held_out.lines(known=known)
     if (
         verdict_of(held_out.acauc) == "over-confident"
         and held_out.num_independent >= FEWEST

@@ -64,7 +64,7 @@ def test_nothing_alarms_about_a_stack_whose_batch_is_drawn_like_its_pairs(
     assert all("This is expected" in of_stack[name].sentence for name in SHIFTS)
     # They are the same numbers, without those about couplings and the tuned net.
     numbers = {one.name: one.value for one in of_anyone.findings}
-    assert len(of_stack.findings) == len(numbers) - 5
+    assert len(of_stack.findings) == len(numbers) - 4
     assert all(one.value == numbers[one.name] for one in of_stack.findings)
     # A posterior with couplings is what all of them are about.
     x_o = drawn(60, seed=2)[1]

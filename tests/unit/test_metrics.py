@@ -1,28 +1,21 @@
 """Scores agree with closed forms and are careful with posteriors that misbehave."""
 
-import contextlib
 import math
-import signal
-import warnings
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
 import torch
-from sbi.inference import NPE, DirectPosterior
+from sbi.inference import DirectPosterior
 from sbi.inference.posteriors import EnsemblePosterior
-from sbi.neural_nets import posterior_nn
 from sbi.utils import BoxUniform
-from sbi.utils.tracking import TensorBoardTracker
-from scipy.stats import binom, kstest
+from scipy.stats import kstest
 from torch import Tensor
-from torch.distributions import Gamma, Normal
-from torch.utils.tensorboard import SummaryWriter
+from torch.distributions import Normal
 
 from sbi_rope import metrics
 from sbi_rope.metrics import Estimate, Evaluation
 from sbi_rope.metrics.evaluation import NOMINAL, estimates_and_ranks, verdict_of
-from sbi_rope.utils.errors import InvalidInputError, LogProbUnavailableError
+from sbi_rope.utils.errors import InvalidInputError
 from tests import gaussian
 from tests.refusals import assert_refused
 
@@ -67,22 +60,6 @@ def scored(
 
 def half(found: Estimate) -> float:
     return (found.high - found.low) / 2
-
-
-@contextlib.contextmanager
-def at_most(seconds: float) -> Iterator[None]:
-    """Raise if the body does not end in time, so that a test that hangs fails."""
-
-    def stop(*_: Any) -> None:
-        raise TimeoutError(f"still running after {seconds} s")
-
-    previous = signal.signal(signal.SIGALRM, stop)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, previous)
 
 
 # Means --------------------------------------------------------------------------------
@@ -150,15 +127,16 @@ class Coin:
 
 
 @pytest.mark.medium
-def test_an_exact_posterior_of_a_discrete_parameter_is_calibrated() -> None:
+def test_an_exact_posterior_of_a_discrete_parameter_is_calibrated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     torch.manual_seed(0)
     theta = torch.bernoulli(torch.full((500, 1), 0.5))
     x = torch.where(torch.rand(500, 1) < 0.95, theta, 1 - theta)
     # In chunks, which must not repeat the same random numbers.
     for chunk_size in (1, 500):
-        found = metrics.evaluate(
-            Coin(), theta, x, num_samples=200, chunk_size=chunk_size, seed=0
-        )
+        monkeypatch.setattr("sbi_rope.metrics.evaluation.CHUNK_SIZE", chunk_size)
+        found = metrics.evaluate(Coin(), theta, x, num_samples=200, seed=0)
         assert verdict_of(found.acauc) == "calibrated"
         assert abs(found.acauc.mean) < 0.04
         assert found.expected_coverage_error < 0.04
@@ -172,16 +150,6 @@ def test_means_and_ranks_come_from_different_samples() -> None:
     estimates, ranks = estimates_and_ranks(samples, theta)
     both = torch.cat([estimates, ranks], dim=1)
     assert abs(float(both.T.corrcoef()[0, 1])) < 3 / 5000**0.5
-    assert not any(scored(ranks, estimates).dependence.found)
-
-
-def test_acauc_equals_its_integral_over_levels() -> None:
-    levels = torch.rand(50, 3, dtype=torch.double).mul(1000).floor() / 1000
-    found = scored((1 + levels) / 2)
-    alpha = (torch.arange(1000, dtype=torch.float64) + 0.5) / 1000
-    inside = (levels.unsqueeze(-1) <= alpha).double()
-    integral = float((alpha - inside).mean())
-    assert found.acauc.mean == pytest.approx(integral, abs=1e-5)
 
 
 def test_coverage_counts_a_level_that_is_equal_to_the_nominal_one() -> None:
@@ -251,45 +219,12 @@ def test_acauc_of_gaussian_posteriors_has_its_exact_and_its_published_value() ->
         (50.0, 0.1, 0.499),
     ):
         posterior = GaussianPosterior(bias, scale)
-        # All observations at a time, which takes a quarter of the time.
-        found = metrics.evaluate(
-            posterior, theta, x, num_samples=1250, chunk_size=1500
-        ).acauc
+        found = metrics.evaluate(posterior, theta, x, num_samples=1250).acauc
         exact = expected_acauc(bias, scale, num_ranks=1000)
         case = f"bias {bias} and scale {scale}: {found}"
         # 0.001: finitely many samples; 0.002: the error of the published value.
         assert abs(found.mean - exact) < 2 * half(found) + 0.001, case
         assert abs(found.mean - published) < 2 * half(found) + 0.002, case
-
-
-@pytest.mark.parametrize("factor", [0.95, 1.05])
-def test_acauc_of_a_factor_near_one_is_its_logarithm_divided_by_pi(
-    factor: float,
-) -> None:
-    # The parameters are the quantiles of a normal distribution, in units of its width.
-    shares = torch.linspace(0, 1, 10_001, dtype=torch.double)[1:-1, None]
-    ranks = NORMAL.cdf(factor * torch.special.ndtri(shares))
-    assert scored(ranks).acauc.mean == pytest.approx(
-        math.log(factor) / math.pi, rel=0.01
-    )
-
-
-def test_skewed_but_exact_posteriors_have_an_acauc_of_zero() -> None:
-    class GammaPosterior(GaussianPosterior):
-        law = Gamma(torch.tensor([1.2]), torch.tensor([1.0]))
-
-        def sample_batched(self, sample_shape: torch.Size, x: Tensor, **_: Any) -> Any:
-            return x + self.law.sample((*sample_shape, len(x)))
-
-        def log_prob_batched(self, theta: Tensor, x: Tensor) -> Tensor:
-            # The truth may lie at the edge of the support, up to rounding.
-            return self.law.log_prob((theta - x).clamp(min=1e-6)).sum(dim=-1)
-
-    torch.manual_seed(0)
-    x = torch.randn(1500, 1)
-    theta = x + GammaPosterior.law.sample((1500,))
-    found = metrics.evaluate(GammaPosterior(), theta, x, num_samples=300)
-    assert verdict_of(found.acauc) == "calibrated"
 
 
 def test_coverage_of_gaussian_posteriors_follows_its_formula() -> None:
@@ -347,43 +282,7 @@ def test_p_values_of_calibrated_posteriors_are_uniform() -> None:
         torch.rand(15, 100, generator=generator),
         torch.randn(15, 100, generator=generator).exp(),
     )
-    assert kstest(found.dependence.p_values, "uniform").pvalue > 0.01
-
-
-def held_out_p_value(n: int, seed: int) -> float:
-    """The p-value of the hold-out posteriors of a Bayesian linear regression of x.
-
-    The pairs have x = 0.7 + 1.4 theta + noise. The posterior of theta given x is exact
-    on a grid, with the coefficients integrated out given the pairs of other folds.
-    """
-    generator = torch.Generator().manual_seed(seed)
-    theta, noise = torch.randn(2, n, generator=generator, dtype=torch.double)
-    x = 0.7 + 1.4 * theta + 0.7 * noise
-    grid = torch.linspace(-5, 5, 1001, dtype=torch.double)
-    on_grid, design = (torch.stack([t**0, t], dim=1) for t in (grid, theta))
-    eye = torch.eye(2, dtype=torch.double)
-    ranks, means = torch.empty(2, n, dtype=torch.double)
-    for fold in range(5):
-        held_out = torch.arange(n) % 5 == fold
-        known, of_known = design[~held_out], x[~held_out]
-        covariance = torch.linalg.inv(known.T @ known / 0.49 + 0.01 * eye)
-        mean = on_grid @ covariance @ known.T @ of_known / 0.49
-        variance = 0.49 + ((on_grid @ covariance) * on_grid).sum(dim=1)
-        log_p = Normal(mean, variance.sqrt()).log_prob(x[held_out, None])
-        share = (log_p - grid.square() / 2).softmax(dim=1)
-        means[held_out] = share @ grid
-        below = (grid <= theta[held_out, None]).double()
-        ranks[held_out] = (share * below).sum(dim=1)
-    return scored(ranks[:, None], means[:, None]).dependence.p_values[0]
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize("n", [15, pytest.param(60, marks=pytest.mark.slow)])
-def test_hold_out_posteriors_of_one_set_of_pairs_give_no_more_alarms(n: int) -> None:
-    """Folds share most of their pairs, so that their errors are alike."""
-    p_values = torch.tensor([held_out_p_value(n, seed) for seed in range(100)])
-    # A number of alarms that is exceeded with a probability of one per cent.
-    assert int((p_values < 0.05).sum()) <= binom.ppf(0.99, 100, 0.05)
+    assert kstest(found.dependence, "uniform").pvalue > 0.01
 
 
 @pytest.mark.parametrize("error", ["slope", "curve", "width in the tail", "width"])
@@ -398,7 +297,7 @@ def test_errors_that_depend_on_the_estimate_are_found(error: str) -> None:
         std = torch.where(mean.abs() > mean.std(), 0.5 * std, std)
     else:
         std = std * (0.5 * mean).exp()
-    assert all(scored(ranks_in(theta, mean, std), mean).dependence.found)
+    assert scored(ranks_in(theta, mean, std), mean).dependence[0] < 0.05
 
 
 @pytest.mark.medium
@@ -410,54 +309,36 @@ def test_errors_that_are_the_same_everywhere_are_not_reported(
     for seed in range(25):
         theta, mean = estimated(60, seed)
         ranks = ranks_in(theta, mean + shift, factor * gaussian.POSTERIOR_STD)
-        p_values.append(scored(ranks, mean).dependence.p_values[0])
+        p_values += scored(ranks, mean).dependence
     assert kstest(p_values, "uniform").pvalue > 0.01
 
 
-def test_shares_are_those_of_each_third() -> None:
-    generator = torch.Generator().manual_seed(1)
-    estimates = torch.randn(90, 2, generator=generator)
-    ranks = torch.rand(90, 2, generator=generator)
-    found = scored(ranks, estimates).dependence
-    for k in range(2):
-        order = estimates[:, k].argsort()
-        for number, rows in enumerate(order.split(30)):
-            inside = ((ranks[rows, k] - 0.5).abs() <= 0.45).double()
-            assert found.shares[k, number] == inside.mean()
-            assert ((estimates[rows, k] > found.edges[k, 0]) == (number > 0)).all()
-            assert ((estimates[rows, k] < found.edges[k, 1]) == (number < 2)).all()
-
-
-def test_parameters_that_are_not_known_are_left_out() -> None:
-    theta, mean = estimated()
-    ranks = ranks_in(theta, 1.3 * mean, gaussian.POSTERIOR_STD)
-    alone = scored(ranks[::2], mean[::2]).dependence
-    gaps = ranks.clone()
-    gaps[1::2] = torch.nan
-    found = scored(gaps, mean).dependence
-    assert found.p_values == alone.p_values
-    assert torch.equal(found.shares, alone.shares)
+def test_coverage_is_said_for_each_third_of_the_estimates() -> None:
+    estimates = torch.arange(90.0).flip(0)[:, None]
+    # Of each third other shares are inside and above the median.
+    ranks = torch.tensor([0.3] * 30 + [0.99] * 15 + [0.6] * 15 + [0.01] * 30)[:, None]
     unknown = torch.full_like(ranks, torch.nan)
-    beside = scored(torch.cat([ranks, unknown], 1), torch.cat([mean, mean], 1))
-    assert beside.dependence.found == (True, False)
-    assert verdict_of(beside.acauc_of_parameters[1]) == "unknown"
-    assert "theta_2 was not measured" in str(beside)
+    found = scored(torch.cat([ranks, unknown], 1), estimates.expand(90, 2))
+    text = " ".join(str(found).split())
+    assert "The coverage of theta_1 depends on its estimate (p = 0.001)" in text
+    assert "90% intervals hold 0%, 50% and 100% of the true parameters" in text
+    assert "and 0%, 100% and 0% are above the median" in text
+    assert "theta_2 was not measured" in text
+    assert "coverage of theta_2" not in text
+    assert math.isnan(found.dependence[1])
 
 
-def test_one_pair_of_each_group_is_tested() -> None:
+def test_one_known_pair_of_each_group_is_tested() -> None:
     theta, mean = estimated()
-    ranks = ranks_in(theta, mean, gaussian.POSTERIOR_STD)
-    pairs = torch.arange(300)
-    twins = scored(
-        torch.cat([ranks, ranks]),
-        torch.cat([mean, mean]),
-        group=torch.cat([pairs, pairs]),
-    )
-    # Other twins are drawn in another order: the p-value is another of the same law.
-    assert twins.dependence.p_values[0] > 0.01
-    assert torch.allclose(
-        twins.dependence.shares, scored(ranks, mean).dependence.shares
-    )
+    ranks = ranks_in(theta, 1.02 * mean, gaussian.POSTERIOR_STD)
+    group = torch.arange(300).repeat(20)
+    twins = scored(ranks.repeat(20, 1), mean.repeat(20, 1), group=group)
+    # All rows would make an error significant that so few do not show.
+    assert scored(twins.ranks, twins.estimates).dependence[0] < 0.01
+    assert twins.dependence[0] > 0.01
+    gaps = torch.cat([ranks, torch.full_like(ranks, torch.nan)])
+    found = scored(gaps, torch.cat([mean, mean])).dependence
+    assert found == scored(ranks, mean).dependence
 
 
 # What is printed ----------------------------------------------------------------------
@@ -482,7 +363,7 @@ def test_an_evaluation_says_what_was_found() -> None:
     assert "The posterior is over-confident: ACAUC +" in text
     assert "mass alone is over-confident" in text
     assert "The coverage of length depends on its estimate (p = 0.001)" in text
-    assert f"90% intervals {wrong.inside(0.9):.0%}" in text
+    assert f"90% intervals {wrong.coverage[89].mean():.0%}" in text
     assert "Too few observations" in str(scored(RANKS[:4]))
 
 
@@ -501,63 +382,36 @@ def test_a_seed_fixes_the_samples_and_leaves_the_global_random_state_alone() -> 
 # Posteriors of sbi --------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def bounded_npe(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> Iterator[tuple[DirectPosterior, Tensor, Tensor]]:
-    """An NPE with a bounded prior, and observations far outside its training data."""
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        prior = BoxUniform(torch.zeros(2), torch.ones(2))
-        theta = prior.sample((400,))
-        x = theta + 0.1 * torch.randn_like(theta)
-        # By default sbi logs into a folder of the working directory.
-        tracker = TensorBoardTracker(SummaryWriter(tmp_path_factory.mktemp("logs")))
-        npe = NPE(prior, density_estimator=posterior_nn("nsf"), tracker=tracker)
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="Maximum number of epochs")
-            npe.append_simulations(theta, x).train(max_num_epochs=2)
-        yield npe.build_posterior(), theta[:20], x[:20] + 1e3
-
-
-def test_calibration_does_not_hang_where_no_sample_is_accepted(
-    bounded_npe: tuple[DirectPosterior, Tensor, Tensor],
-) -> None:
-    npe, theta, x = bounded_npe
-    for posterior in (npe, EnsemblePosterior([npe, npe])):
-        with at_most(10), warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
-            samples = metrics.draw_samples(posterior, x, num_samples=100)
-        assert scored(estimates_and_ranks(samples, theta)[1]).acauc.mean > 0.4
-
-
-def test_samples_are_drawn_where_the_rejection_of_sbi_would_not_end() -> None:
-    x = torch.tensor([[0.5, -1.0], [2.0, 0.0]])
+def far_posterior(kind: type[DirectPosterior] = DirectPosterior) -> Any:
+    """An NPE whose prior is far from all that it draws."""
     far = BoxUniform(torch.full((2,), 100.0), torch.full((2,), 101.0))
-    posterior = DirectPosterior(gaussian.GaussianEstimator(), far)
-    with at_most(10):
-        samples = metrics.draw_samples(posterior, x, num_samples=4000)
-    mean, std = gaussian.GAIN * x, torch.tensor(gaussian.POSTERIOR_STD)
-    assert torch.allclose(samples.mean(dim=0), mean, atol=5 * float(std) / 4000**0.5)
-    assert torch.allclose(samples.std(dim=0), std.expand(2, 2), rtol=0.1)
+    return kind(gaussian.GaussianEstimator(), far)
 
 
-def test_log_probs_of_an_npe_are_those_of_its_network_inside_the_prior(
-    bounded_npe: tuple[DirectPosterior, Tensor, Tensor],
-) -> None:
-    posterior, theta, x = bounded_npe
-    with at_most(10):
-        found = metrics.evaluate(posterior, theta, x, num_samples=50)
-        moved = metrics.evaluate(posterior, theta + 5, x, num_samples=50)
-    raw = posterior.posterior_estimator.log_prob(theta.unsqueeze(0), x)[0]
+X_O = torch.tensor([[0.5, -1.0], [2.0, 0.0]])
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_samples_are_drawn_where_the_rejection_of_sbi_would_not_end() -> None:
+    posterior, std = far_posterior(), gaussian.POSTERIOR_STD
+    for one in (posterior, EnsemblePosterior([posterior, posterior])):
+        samples = metrics.draw_samples(one, X_O, num_samples=4000)
+        error = 5 * std / 4000**0.5
+        assert torch.allclose(samples.mean(dim=0), gaussian.GAIN * X_O, atol=error)
+        assert torch.allclose(samples.std(dim=0), torch.tensor(std), rtol=0.1)
+
+
+def test_log_probs_of_an_npe_are_those_of_its_network_inside_the_prior() -> None:
+    posterior, theta = far_posterior(), torch.full((2, 2), 100.5)
+    found = metrics.evaluate(posterior, theta, X_O, num_samples=50)
+    moved = metrics.evaluate(posterior, theta + 5, X_O, num_samples=50)
+    raw = posterior.posterior_estimator.log_prob(theta, X_O)
     assert torch.allclose(found.log_prob, raw.detach().double(), rtol=1e-5)
     assert moved.log_prob.isneginf().all()
     assert "100.0% of the true parameters have density zero" in str(moved)
 
 
-def test_a_posterior_with_bounded_rejection_is_called_as_it_is(
-    bounded_npe: tuple[DirectPosterior, Tensor, Tensor],
-) -> None:
+def test_a_posterior_with_bounded_rejection_is_called_as_it_is() -> None:
     class Bounded(DirectPosterior):
         def leakage_correction(self, x: Tensor, **options: Any) -> Any:
             raise AssertionError("only looked at")
@@ -570,9 +424,8 @@ def test_a_posterior_with_bounded_rejection_is_called_as_it_is(
             assert options == {}
             return torch.zeros(theta.shape[:-1]).reshape(-1, len(x))
 
-    npe, theta, x = bounded_npe
-    posterior = Bounded(npe.posterior_estimator, npe.prior)
-    assert metrics.evaluate(posterior, theta, x, num_samples=20).lpp.mean == 0.0
+    found = metrics.evaluate(far_posterior(Bounded), X_O, X_O, num_samples=20)
+    assert found.lpp.mean == 0.0
 
 
 # Errors -------------------------------------------------------------------------------
@@ -591,30 +444,24 @@ def test_an_evaluation_says_what_is_wrong_with_parameters_and_their_units() -> N
         assert_refused(match, metrics.evaluate, GaussianPosterior(), **good | change)
 
 
-def test_a_posterior_without_density_is_refused() -> None:
-    class NoDensity(GaussianPosterior):
-        log_prob_batched = property()  # type: ignore[assignment]
-
-    with pytest.raises(LogProbUnavailableError, match="NoDensity"):
-        metrics.evaluate(NoDensity(), *gaussian_pairs(30))
-
-
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_nan_and_infinite_log_probs_raise_and_say_where(value: float) -> None:
     class Broken(GaussianPosterior):
         def log_prob_batched(self, theta: Tensor, x: Tensor) -> Tensor:
-            return torch.where(x[:, 0] == 7.0, value, x[:, 0]).unsqueeze(0)
+            return torch.where(x[:, 0] == 107.0, value, x[:, 0]).unsqueeze(0)
 
-    x = torch.arange(12.0).unsqueeze(1)
-    with pytest.raises(InvalidInputError, match=r"first: \[7\]"):
-        metrics.evaluate(Broken(), x, x, chunk_size=5)
+    x = torch.arange(120.0).unsqueeze(1)
+    with pytest.raises(InvalidInputError, match=r"first: \[107\]"):
+        metrics.evaluate(Broken(), x, x)
 
 
-def test_nan_samples_raise_and_say_where() -> None:
+@pytest.mark.parametrize("wrong", ["NaN", r"\(20, 12, 2\)"])
+def test_samples_that_are_nan_or_too_many_raise(wrong: str) -> None:
     class Broken(GaussianPosterior):
         def sample_batched(self, sample_shape: torch.Size, x: Tensor, **_: Any) -> Any:
-            return torch.where(x == 7.0, torch.nan, x).expand(*sample_shape, *x.shape)
+            rows = x.expand(*sample_shape, *x.shape)
+            return rows.log() if wrong == "NaN" else rows.repeat(1, 1, 2)
 
-    x = torch.arange(12.0).unsqueeze(1)
-    with pytest.raises(InvalidInputError, match=r"NaN samples.*first: \[7\]"):
-        metrics.evaluate(Broken(), x, x, chunk_size=5)
+    x = torch.arange(12.0).unsqueeze(1) - 1
+    with pytest.raises(InvalidInputError, match=wrong):
+        metrics.evaluate(Broken(), x, x, num_samples=20)
