@@ -6,8 +6,6 @@ from typing import Any
 
 from sbi_rope.utils.errors import RoPEError, shown
 
-__all__ = ["assert_refused"]
-
 
 def assert_refused(
     match: str,
@@ -16,20 +14,11 @@ def assert_refused(
     error: type[RoPEError] = RoPEError,
     **options: Any,
 ) -> None:
-    """Fail unless a call raises an error of the package whose message matches.
-
-    Args:
-        match: A regular expression that the message contains.
-        call: What is called.
-        arguments: The arguments of the call, at least one of which is bad.
-        error: The class of the error.
-        options: The arguments of the call by name.
-    """
+    """Fail unless a call raises an error of the package whose message matches."""
     given = f"{call} of {shown(arguments)} and {shown(options)}"
     try:
         call(*arguments, **options)
     except error as raised:
-        if not re.search(match, str(raised)):
-            raise AssertionError(f"{given}: {match!r} is not in {raised}") from raised
+        assert re.search(match, str(raised)), f"{given}: {match!r} is not in {raised}"
     else:
         raise AssertionError(f"{given} was accepted instead of refused for {match!r}")

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, MultivariateNormal
 
+from sbi_rope.data.labels import log_student_t
 from sbi_rope.data.pairs import Pairs
 from sbi_rope.utils.seeds import seeded
 from sbi_rope.utils.tensors import as_batch
@@ -45,32 +46,30 @@ def learn_parameters(
     r"""Weight simulations so that their parameters are distributed like those of pairs.
 
     Each parameter is replaced by its normal score u under the prior. A continuous prior
-    is then close to the normal distribution :math:`\mathcal N(0, R)`, with R the
-    correlation of the scores. Real parameters are modelled as
+    is then close to :math:`\mathcal N(0, R)`, with R the correlation of the scores.
+    Real parameters are modelled as
 
     .. math::
         u \sim \mathcal N(\mu, \Lambda), \quad
         \Lambda \sim \mathrm{IW}(c\, R, c + d + 1), \quad
         \mu \mid \Lambda \sim \mathcal N(0, \Lambda / c),
 
-    averaged over values of c by their evidence, so that the predictive density is a
-    mixture t(u) of Student t densities. The alternative is that real parameters follow
-    the prior, with a probability of one half before any pair is seen and :math:`\pi`
+    averaged over values of c by their evidence. The predictive density t(u) is then a
+    mixture of Student t densities. The alternative is that real parameters follow the
+    prior, with a probability of one half before any pair is seen and :math:`\pi`
     afterwards. Simulations from the prior are drawn with probabilities proportional to
 
     .. math::
         \pi + (1 - \pi)\, t(u) / \mathcal N(u; 0, R) .
 
-    Discrete parameters, of which more than one in twenty simulations share a value, are
-    left out: they stay distributed as in the prior, given the others. Scores of pairs
-    are cut off where one of twenty sets of pairs from the prior reaches, so that labels
-    on a bound do not count for more with more simulations.
+    Discrete parameters, of which more than one in twenty simulations share a value,
+    stay distributed as in the prior, given the others.
 
     Args:
         theta_cal: Parameters of the pairs, shape ``(n_c, d)``. Equal ones count once,
             because several recordings of one person are one draw from the distribution.
-            Of labels that are not exact, R draws of each, shape ``(n_c, R, d)``. The
-            probabilities are then averages over up to ten sets of draws.
+            Of labels that are not exact, R draws of each, shape ``(n_c, R, d)``, over
+            which the probabilities are averaged.
         theta: Parameters of at least two simulations from the prior, shape ``(n, d)``.
         weights: How many draws from the distribution each pair counts as, shape
             ``(n_c,)``; one if None. The weights of equal parameters are added.
@@ -169,13 +168,4 @@ def _fit(
     )
     freedom = new_degrees - d + 1
     factor = torch.linalg.cholesky(new_scale * (total + 1) / (total * freedom))
-    centred = (u - n / total * average).T
-    squares = torch.linalg.solve_triangular(factor, centred, upper=False).square()
-    log_t = (
-        math.lgamma((freedom + d) / 2)
-        - math.lgamma(freedom / 2)
-        - d / 2 * math.log(freedom * math.pi)
-        - factor.diagonal().log().sum()
-        - (freedom + d) / 2 * torch.log1p(squares.sum(dim=0) / freedom)
-    )
-    return log_evidence, log_t
+    return log_evidence, log_student_t(u, n / total * average, factor, freedom)

@@ -111,7 +111,7 @@ def residual_finding(
         return Finding(NAME, "Not tested, because `num_folds` is None.")
     theta = pairs.mean.detach().cpu().double()
     residuals = held_out.embedded - held_out.targets
-    labels = torch.stack([pairs.group, pairs.label.group]).unique(dim=1)
+    labels = torch.stack([pairs.group, pairs.label]).unique(dim=1)
     if labels.shape[1] > pairs.num_groups:
         # The mean over parameters that differ would depend on them less.
         chosen = one_of_each_group(held_out.group, seed=0)

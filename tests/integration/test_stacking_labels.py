@@ -142,7 +142,7 @@ def test_a_parameter_that_was_never_measured_is_named(tmp_path: Path) -> None:
 def test_labels_without_noise_take_the_path_of_exact_ones() -> None:
     exact, found = (
         validated(labelled(THETA, **some), candidates=[PRIOR, CANDIDATES[3]])
-        for some in ({}, {"theta_cov": torch.zeros(2, 2), "weights": [1.0] * 20})
+        for some in ({}, {"theta_std": 0.0, "weights": [1.0] * 20})
     )
     assert torch.equal(exact.log_scores, found.log_scores)
     assert torch.equal(exact.held_out.log_prob, found.held_out.log_prob)
