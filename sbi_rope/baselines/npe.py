@@ -96,6 +96,6 @@ class ReferenceNPE(PlainNPE):
         theta = self._data.read_theta(theta)
         like = theta.new_empty(0, *self._data.event_shape or ())
         with seeded(seed):
-            x = Simulated(simulator, self._prior, like=like)(theta)
+            x, _ = Simulated(simulator, self._prior, like=like).simulate(theta)
         valid = torch.isfinite(x).flatten(1).all(dim=1)
         return theta[valid], x[valid]

@@ -37,7 +37,7 @@ CHUNK_SIZE = 100
 # and the share of a variance that is added to it, so that none is zero.
 FREEDOM, JITTER = 5.0, 1e-6
 
-# Mean and covariance, or its Cholesky factor, for each label, ``(n, d)``, ``(n, d, d)``.
+# Means ``(n, d)``, and covariances or their Cholesky factors ``(n, d, d)``.
 Moments = tuple[Tensor, Tensor]
 
 
@@ -57,9 +57,7 @@ def given_labels(
     theta = as_numbers("theta", theta, device=like.device, names=names)
     if theta.ndim == 3:
         if theta_std is not None:
-            raise InvalidInputError(
-                "Expected no `theta_std` for labels that are draws."
-            )
+            raise InvalidInputError("Expected no `theta_std` of labels given as draws.")
         draws = as_batch("theta", theta, (theta.shape[1], dim)).to(like.dtype)
         check_in_support("theta", draws.reshape(-1, dim), prior)
         with seeded(0):

@@ -167,8 +167,8 @@ class Pairs(Rows):
     def __str__(self) -> str:
         """Say in one sentence what is known about the parameters."""
         text = f"{len(self)} {'exact ' if self.are_exact else ''}labels"
-        if (num_groups := self.num_groups) < len(self):
-            text += f" in {num_groups} groups"
+        if self.num_groups < len(self):
+            text += f" in {self.num_groups} groups"
         if self.are_drawn:
             text += f", each given as {self.theta.shape[1]} draws"
         elif not self.are_exact:
@@ -176,9 +176,8 @@ class Pairs(Rows):
             num_partial = int((~self.is_measured).any(dim=1).sum())
             text += f", {num_noisy} with noise and {num_partial} partial"
         if (self.weight != 1).any():
-            number, total = effective_number(self.weight), float(self.weight.sum())
-            text += f", weighted like {number:.1f} of equal weight"
-            text += f", and counted as {total:.3g}"
+            text += f", weighted like {effective_number(self.weight):.1f} of equal "
+            text += f"weight, and counted as {float(self.weight.sum()):.3g}"
         return text
 
 

@@ -123,11 +123,10 @@ def _learn(
     correlation = correlation + 1e-6 * torch.eye(len(correlation)).to(u)
     normal = MultivariateNormal(torch.zeros_like(u[0]), correlation)
     fits = [_fit(u_cal, u, counts, correlation, strength) for strength in STRENGTHS]
-    evidence = torch.stack([log_evidence for log_evidence, _ in fits])
+    evidence, log_t = (torch.stack(parts, dim=-1) for parts in zip(*fits, strict=True))
     average = evidence.logsumexp(dim=0) - math.log(len(fits))
     probability = float(torch.sigmoid(counts @ normal.log_prob(u_cal) - average))
-    predictive = torch.stack([log_t for _, log_t in fits], dim=1)
-    log_t = (predictive + evidence.log_softmax(dim=0)).logsumexp(dim=1)
+    log_t = (log_t + evidence.log_softmax(dim=0)).logsumexp(dim=1)
     return probability, torch.softmax(log_t - normal.log_prob(u), dim=0)
 
 
@@ -147,9 +146,10 @@ def normal_scores(theta: Tensor, reference: Tensor) -> Tensor:
 def _fit(
     u_cal: Tensor, u: Tensor, counts: Tensor, correlation: Tensor, strength: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the log evidence at one strength, and the log predictive density at u."""
-    # These are the conjugate formulas for a normal distribution with unknown mean and
-    # covariance.
+    """Return the log evidence at one strength, and the log predictive density at u.
+
+    The prior is conjugate to a normal distribution of unknown mean and covariance.
+    """
     n, d = float(counts.sum()), u_cal.shape[1]
     degrees, scale = strength + d + 1, strength * correlation
     average = counts @ u_cal / n

@@ -28,16 +28,16 @@ Result = tuple[Tensor, str]
 
 # A simulator may fail at some parameters, so that it is tried at so many.
 TRIES = 5
-# Rows that are simulated before they are embedded, in batches and one by one, and rows
-# of a batch for each worker.
+# Rows that are simulated before they are embedded, in batches and one by one, and those
+# of a batch that a worker gets.
 BATCHED_CHUNK, SINGLE_CHUNK, ROWS_OF_WORKER = 1000, 100, 100
 # A progress bar appears after this many seconds.
 DELAY = 2.0
 # The most numbers in simulations that are kept, in distances that are computed at once,
 # and in the simulations that planes are fitted to at once.
 MAX_KEPT, MAX_DISTANCES, MAX_NUMBERS = 2**27, 50_000_000, 2**24
-# The plane at a theta is fitted to so many stored simulations, at least. Its ridge
-# keeps it level where parameters do not vary.
+# The fewest stored simulations that a plane is fitted to, and the ridge that keeps it
+# level where parameters do not vary.
 NUM_AROUND, LEVEL = 50, 1e-6
 # Draws of the prior that stored parameters are compared with, and the p-value below
 # which they differ.
@@ -164,10 +164,6 @@ class Simulated:
         with seeded(0):
             self._way = self._working_way(function)
 
-    def __call__(self, theta: Tensor) -> Tensor:
-        """Simulate, theta ``(n, d)`` to x ``(n, *event)``; x may contain NaN."""
-        return self._simulate(theta)[0]
-
     def from_prior(
         self, n: int, *, seed: int | None = None, progress: bool = False
     ) -> tuple[Tensor, Tensor]:
@@ -244,7 +240,7 @@ class Simulated:
         options = {"desc": label, "total": len(theta), "delay": DELAY}
         with progress_bar(show=progress, **options) as bar:
             for part in theta.split(size):
-                x, error = self._simulate(part)
+                x, error = self.simulate(part)
                 bar.update(len(part))
                 first_error = first_error or error
                 ok = self._readable(x)
@@ -263,8 +259,8 @@ class Simulated:
         self.num_dropped += _warn_of_dropped(ok, f"simulations {where}", because)
         return torch.cat(embeddings), ok
 
-    def _simulate(self, theta: Tensor) -> Result:
-        """Simulate rows, in this process or in workers, and count them."""
+    def simulate(self, theta: Tensor) -> Result:
+        """Simulate theta ``(n, d)``, in this process or in workers, and count rows."""
         self.num_calls += len(theta)
         if not self._num_workers:
             return self._way.simulate(theta)
@@ -332,15 +328,14 @@ class Stored:
         used, row = nearest.unique(return_inverse=True)
         z = torch.cat([embed(x[some]) for some in used.split(BATCHED_CHUNK)])
         turn = (torch.arange(count) % number).repeat(n).to(place)
-        ridge = torch.full((d + 1,), LEVEL).to(at).double()
-        ridge[0] = 0.0
+        ridge = torch.tensor([0.0] + [LEVEL] * d).to(at).double().diag()
         scale = ((number - 1) / max(1, number - d - 1)) ** 0.5
         chunk, moved = max(1, MAX_NUMBERS // (number * z[0].numel())), []
         for of, k in zip(place.split(chunk), turn.split(chunk), strict=True):
             offsets = stored[nearest[of]].double() - at[of].double()[:, None]
             design = torch.cat([torch.ones_like(offsets[..., :1]), offsets], dim=-1)
             around = z[row[of]].double()
-            normal = design.mT @ design + ridge.diag()
+            normal = design.mT @ design + ridge
             plane = torch.linalg.solve(normal, design.mT @ around)
             each = torch.arange(len(of)).to(of)
             residual = around[each, k] - (design[each, None, k] @ plane)[:, 0]
@@ -442,7 +437,7 @@ def source_of(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Moments(Rows):
-    """Means and covariance of the embeddings of simulations at the parameters of pairs.
+    """The moments of embeddings of simulations at the parameters of pairs.
 
     Attributes:
         means: Means at R parameters that the label of each pair leaves possible, shape
@@ -476,15 +471,13 @@ def draws(
     """
     theta = pairs.theta.repeat(1, -(-count // pairs.theta.shape[1]), 1)
     z = source.at(theta, embed, progress=progress)
-    failed = z.isnan().all(dim=2)
-    if not failed.any():
+    is_there = ~z.isnan().all(dim=2)
+    if is_there.all():
         return theta, z
     # The k-th that failed is replaced by the k-th that is there.
-    there = failed.int().argsort(dim=1, stable=True)
-    rank = ((~failed).cumsum(dim=1) - 1).where(
-        ~failed, (failed.cumsum(dim=1) - 1) % (~failed).sum(dim=1, keepdim=True)
-    )
-    chosen = there.gather(1, rank)[..., None]
+    rows = (~is_there).int().argsort(dim=1, stable=True)
+    k = is_there.cumsum(dim=1).where(is_there, (~is_there).cumsum(dim=1)) - 1
+    chosen = rows.gather(1, k % is_there.sum(dim=1, keepdim=True))[..., None]
     return theta.take_along_dim(chosen, 1), z.take_along_dim(chosen, 1)
 
 
