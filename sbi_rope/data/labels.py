@@ -68,16 +68,14 @@ def given_labels(
     is_measured = ~torch.isnan(y)
     as_batch("theta", y.where(is_measured, 0.0))  # Inf is no measurement
     std = 0.0 if theta_std is None else theta_std
-    std = as_numbers("theta_std", std, device=like.device, names=names).double()
-    if std.shape not in ((), (dim,), y.shape):
+    std = as_numbers("theta_std", std, device=like.device, names=names)
+    if std.shape in ((), (dim,)):
+        std = std.expand(y.shape)
+    std = as_batch("theta_std", std, (dim,), rows=len(y), finite=False)
+    std = as_batch("theta_std", std.where(is_measured, 0.0)).double()
+    if (bad := std < 0).any():
         raise InvalidInputError(
-            f"Expected `theta_std` of shape (), {(dim,)} or {tuple(y.shape)}; got "
-            f"{tuple(std.shape)}."
-        )
-    std = std.expand_as(y).where(is_measured, 0.0)
-    if (bad := ~(torch.isfinite(std) & (std >= 0))).any():
-        raise InvalidInputError(
-            f"Expected `theta_std` to be finite and not negative; got {std[bad][0]:g}."
+            f"Expected `theta_std` not to be negative; got others in {rows_with(bad)}."
         )
     # Noise may move a label out of the prior, but an exact one must be inside.
     is_exact = (is_measured & (std == 0)).all(dim=1)
@@ -165,11 +163,7 @@ def _systematic(shares: Tensor, count: int) -> Tensor:
 
 
 def nodes_of(
-    pairs: Pairs,
-    samples: Sequence[Tensor],
-    prior: PriorDistribution,
-    *,
-    num_nodes: int,
+    pairs: Pairs, samples: Sequence[Tensor], prior: PriorDistribution, *, num_nodes: int
 ) -> Nodes:
     r"""Return the nodes at which the densities of labels are computed.
 
@@ -214,11 +208,7 @@ def _references(
 
 
 def _place_nodes(
-    pairs: Pairs,
-    samples: Sequence[Tensor],
-    prior: PriorDistribution,
-    *,
-    num_nodes: int,
+    pairs: Pairs, samples: Sequence[Tensor], prior: PriorDistribution, *, num_nodes: int
 ) -> Nodes:
     """Draw nodes of measurements, weighted zero outside the support of the prior."""
     references, (n, d) = _references(pairs, samples, prior), pairs.y.shape

@@ -45,22 +45,17 @@ def learn_parameters(
 ) -> ParameterDistribution:
     r"""Weight simulations so that their parameters are distributed like those of pairs.
 
-    Each parameter is replaced by its normal score u under the prior. A continuous prior
-    is then close to :math:`\mathcal N(0, R)`, with R the correlation of the scores.
-    Real parameters are modelled as
+    Each parameter is replaced by its normal score u under the prior, with correlation
+    R. With equal weight before any pair is seen, real parameters follow the prior, or
 
     .. math::
         u \sim \mathcal N(\mu, \Lambda), \quad
         \Lambda \sim \mathrm{IW}(c\, R, c + d + 1), \quad
         \mu \mid \Lambda \sim \mathcal N(0, \Lambda / c),
 
-    averaged over values of c by their evidence. The predictive density t(u) is then a
-    mixture of Student t densities. The alternative is that real parameters follow the
-    prior, with a probability of one half before any pair is seen and :math:`\pi`
-    afterwards. Simulations from the prior are drawn with probabilities proportional to
-
-    .. math::
-        \pi + (1 - \pi)\, t(u) / \mathcal N(u; 0, R) .
+    averaged over values of c by their evidence. With :math:`\pi` the probability of the
+    prior afterwards and t(u) the predictive density, simulations are drawn with
+    probabilities proportional to :math:`\pi + (1 - \pi)\, t(u) / \mathcal N(u; 0, R)`.
 
     Discrete parameters, of which more than one in twenty simulations share a value,
     stay distributed as in the prior, given the others.
@@ -146,10 +141,7 @@ def normal_scores(theta: Tensor, reference: Tensor) -> Tensor:
 def _fit(
     u_cal: Tensor, u: Tensor, counts: Tensor, correlation: Tensor, strength: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the log evidence at one strength, and the log predictive density at u.
-
-    The prior is conjugate to a normal distribution of unknown mean and covariance.
-    """
+    """Return the log evidence of a value of c, and the log predictive density at u."""
     n, d = float(counts.sum()), u_cal.shape[1]
     degrees, scale = strength + d + 1, strength * correlation
     average = counts @ u_cal / n

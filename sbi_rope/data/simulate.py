@@ -305,19 +305,15 @@ class Stored:
     def at(self, theta: Tensor, embed: Embed, *, progress: bool = False) -> Tensor:
         r"""Return stored simulations near the parameters, moved to them.
 
-        A plane is fitted to the embeddings z of the K simulations nearest to theta: 50
-        or, with many parameters, five for each coefficient. Simulations are moved along
-        the plane from their own parameters to theta (regression adjustment),
+        A plane is fitted to the embeddings z of the K nearest simulations: 50 or, with
+        many parameters, five for each coefficient. These are moved along it to theta,
 
         .. math:: z(\theta) + c\, r_k, \qquad c^2 = (K - 1) / (K - d - 1),
 
         where c makes up for what the plane takes from the residuals r. The s-th theta
         of a pair takes the s-th nearest simulation, so that residuals do not repeat.
 
-        References:
-            | Approximate Bayesian Computation in Population Genetics (Beaumont et al.,
-              2002)
-            | https://doi.org/10.1093/genetics/162.4.2025
+        Source: regression adjustment, https://doi.org/10.1093/genetics/162.4.2025.
         """
         stored, x = self._all(progress=progress)
         n, count, d = theta.shape
@@ -507,17 +503,11 @@ def moments(
 ) -> Moments:
     r"""Return the moments of simulations at the parameters of each pair.
 
-    At exact parameters these are the moments of ``count`` simulations. Otherwise one
-    simulation is made at each draw of a label, and a surface is fitted to them, linear
-    or, with enough draws, quadratic. Its values at the draws are the possible means.
-    The covariance is that of the residuals.
-
-    A surface also fits the noise of the simulations. Its linear and its quadratic terms
-    are shrunk by how much of their size is noise, as James and Stein did.
-
-    References:
-        | Estimation with Quadratic Loss (James and Stein, 1961)
-        | https://projecteuclid.org/euclid.bsmsp/1200512173
+    At exact parameters these are the moments of ``count`` simulations. Otherwise a
+    surface is fitted to simulations at the draws of a label, linear or, with enough
+    draws, quadratic. Its values at the draws are the possible means, and the covariance
+    is that of the residuals. Its linear and its quadratic terms are shrunk by how much
+    of their size is noise (James and Stein, Estimation with Quadratic Loss, 1961).
     """
     theta, simulated = draws(source, pairs, count, embed, progress=progress)
     simulated = simulated.double()

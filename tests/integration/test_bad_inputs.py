@@ -162,7 +162,7 @@ def shape(*sizes: int) -> Callable[[Tensor], bool]:
 # What some bad inputs mean to some calls, as a condition on the result.
 MEANS: dict[str, Callable[[Any], bool]] = {
     # A parameter that was not measured is imputed.
-    "RoPE.append_calibration(theta: NaN)": finite,
+    "RoPE.append_calibration(theta: NaN)": finite
 }
 for _name in CALLS:
     if "log_prob" in _name:  # one of the parameters is impossible

@@ -70,18 +70,6 @@ def test_a_split_is_a_cut_through_a_permutation(
     assert torch.equal(train, order[count:])
 
 
-def test_pairs_of_a_group_are_on_the_same_side() -> None:
-    for seed in range(5):
-        torch.manual_seed(seed)
-        theta = torch.randn(12, 2).repeat(5, 1)[torch.randperm(60)]
-        train, held_out = pairs_of(theta).split(0.25)
-        assert sorted([*train.tolist(), *held_out.tolist()]) == list(range(60))
-        assert len(held_out) == 15
-        assert not {*map(tuple, theta[train].tolist())} & {
-            *map(tuple, theta[held_out].tolist())
-        }
-
-
 def test_a_group_larger_than_what_is_held_out_is_trained_on() -> None:
     groups = torch.tensor([0] * 60 + [1] * 10 + [2] * 10 + [3] * 10 + [4] * 10)
     assert all(len(split_pairs(groups, 0.2)[1]) == 20 for _ in range(20))

@@ -30,11 +30,7 @@ THETA = torch.tensor([[0.3, 0.4], [0.6, -0.8], [-0.1, 0.9]])
 
 
 def simulated(function: Callable[[Any], Any], *shape: int, dim: int = 2) -> Simulated:
-    return Simulated(
-        function,
-        problems.box(dim),
-        like=torch.zeros(0, *(shape or (2,))),
-    )
+    return Simulated(function, problems.box(dim), like=torch.zeros(0, *(shape or (2,))))
 
 
 def itself(x: Tensor) -> Tensor:
