@@ -102,9 +102,7 @@ class FRISBI(Method):
         h, density = frozen_statistics(npe)
         warn_of_far_entries("x", self._data.calibration[1], h)
         source, embedding = self._source(), partial(embed, h)
-        _, simulated = source.from_prior(
-            NUM_SIMULATIONS, embedding, progress=show_progress_bars
-        )
+        _, simulated = source.from_prior(NUM_SIMULATIONS, progress=show_progress_bars)
         z = targets(
             source,
             self._data.pairs,
@@ -116,7 +114,7 @@ class FRISBI(Method):
         aligned = Aligned(
             density,
             trainable_copy(h, z),
-            torch.cat([simulated, z]),
+            torch.cat([embedding(simulated), z]),
             self._data.observations.shape[1:],
             self.gamma,
         )

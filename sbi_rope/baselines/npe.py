@@ -94,8 +94,8 @@ class ReferenceNPE(PlainNPE):
             Parameters and simulations, without those that are not finite.
         """
         theta = self._data.read_theta(theta)
-        shape = self._data.event_shape or torch.Size()
+        like = theta.new_empty(0, *self._data.event_shape or ())
         with seeded(seed):
-            x = Simulated(simulator, self._prior, event_shape=shape, like=theta)(theta)
+            x, _ = Simulated(simulator, self._prior, like=like).simulate(theta)
         valid = torch.isfinite(x).flatten(1).all(dim=1)
         return theta[valid], x[valid]

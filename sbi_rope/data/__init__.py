@@ -3,7 +3,4 @@
 from sbi_rope.data.pairs import Pairs
 from sbi_rope.data.simulate import parallel
 
-__all__ = [
-    "Pairs",
-    "parallel",
-]
+__all__ = ["Pairs", "parallel"]

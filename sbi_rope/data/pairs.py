@@ -5,10 +5,10 @@ A group is held out as a whole, because a network can learn by heart whom it has
 
 import math
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Hashable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
-from typing import Any, TypeVar
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -16,95 +16,32 @@ from torch import Tensor
 from sbi_rope.utils.errors import InvalidInputError, RoPEWarning, warn_user
 from sbi_rope.utils.seeds import seeded
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
 # Fewer groups than this leave nothing to hold out.
 MIN_PAIRS_FOR_HOLDOUT = 5
 # Without a hold-out nothing says when to stop, so little is risked.
 EPOCHS_WITHOUT_HOLDOUT = 50
 
-Table = TypeVar("Table")
 
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Labels:
-    r"""What was measured of the parameters of pairs.
-
-    A label is a measurement of some or all parameters, exact where R is zero,
-    :math:`y \sim \mathcal N(\theta, R)`, or draws of all parameters from
-    :math:`p(\theta \mid \text{label})` under the prior of NPE.
-
-    Attributes:
-        y: The measurements, NaN where there are none, shape ``(n, d)``. Of a label
-            given as draws, their mean.
-        covariance: R, zero for exact and missing parameters, ``(n, d, d)``, float64.
-        draws: Shape ``(n, S, d)``; S is zero for measurements.
-    """
-
-    y: Tensor
-    covariance: Tensor
-    draws: Tensor
-
-    @classmethod
-    def exact(cls, theta: Tensor) -> "Labels":
-        """Return labels that are the true parameters, shape ``(n, d)``."""
-        n, d = theta.shape
-        covariance = theta.new_zeros(n, d, d, dtype=torch.double)
-        return cls(y=theta, covariance=covariance, draws=theta.new_empty(n, 0, d))
+class Rows:
+    """A dataclass of tensors, each with one row for each pair."""
 
     def __len__(self) -> int:
-        return len(self.y)
+        return len(getattr(self, fields(self)[0].name))  # type: ignore[arg-type]
 
-    def __getitem__(self, rows: Tensor) -> "Labels":
-        return _map(lambda value: value[rows], self)
-
-    def __add__(self, others: "Labels") -> "Labels":
-        """Return these labels followed by others with as many draws."""
-        if not len(self):
-            return others
-        if self.draws.shape[1] != others.draws.shape[1]:
-            raise InvalidInputError(
-                "Expected labels with as many draws as those appended before, "
-                f"{self.draws.shape[1]}; got {others.draws.shape[1]}."
-            )
-        return _map(lambda *values: torch.cat(values), self, others)
-
-    @property
-    def are_drawn(self) -> bool:
-        """Whether they are draws, and no measurements."""
-        return self.draws.shape[1] > 0
-
-    @property
-    def is_measured(self) -> Tensor:
-        """Which parameters were measured, exactly or with noise, shape ``(n, d)``."""
-        return ~torch.isnan(self.y)
-
-    @property
-    def is_noisy(self) -> Tensor:
-        """Which parameters were measured with noise, shape ``(n, d)``."""
-        return self.covariance.diagonal(dim1=1, dim2=2) > 0
-
-    @property
-    def is_exact(self) -> Tensor:
-        """Which labels know all parameters exactly, shape ``(n,)``."""
-        is_known = (self.is_measured & ~self.is_noisy).all(dim=1)
-        return is_known & (not self.are_drawn)
-
-    @property
-    def are_exact(self) -> bool:
-        """Whether all parameters of all labels are known exactly."""
-        return bool(self.is_exact.all())
-
-    @property
-    def group(self) -> Tensor:
-        """A number for each label, the same for equal labels, shape ``(n,)``."""
-        # NaN is not equal to itself.
-        parts = (self.y.nan_to_num(), self.is_measured, self.covariance, self.draws)
-        known = [part.double().flatten(1) for part in parts]
-        return groups_of(torch.cat(known, dim=1)).to(self.y.device)
+    def __getitem__(self, rows: Tensor) -> "Self":
+        return type(self)(**{name: value[rows] for name, value in vars(self).items()})
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Pairs:
+class Pairs(Rows):
     r"""Real observations with labels; all tensors are on the device of NPE.
+
+    A label is a measurement of some or all parameters, exact or with normal noise,
+    :math:`y_j \sim \mathcal N(\theta_j, \sigma_j^2)`, or draws of all parameters from
+    :math:`p(\theta \mid \text{label})` under the prior of NPE.
 
     Attributes:
         theta: Draws from :math:`p(\theta \mid \text{label})` under the prior, shape
@@ -112,40 +49,80 @@ class Pairs:
         x: Observations, shape ``(n, *event)``.
         group: The number of the person or specimen of each pair, shape ``(n,)``.
         weight: How many pairs each pair counts as, float64, shape ``(n,)``.
-        label: What was measured.
+        y: The measurements, NaN where there are none, shape ``(n, d)``. Of a label
+            given as draws, their mean.
+        std: The noise, zero for exact and missing parameters, and NaN for labels given
+            as draws, ``(n, d)``, float64.
     """
 
     theta: Tensor
     x: Tensor
     group: Tensor
     weight: Tensor
-    label: Labels
+    y: Tensor
+    std: Tensor
 
     @classmethod
     def exact(cls, theta: Tensor, x: Tensor) -> "Pairs":
         """Return pairs of parameters ``(n, d)`` and x; equal ones share a group."""
-        label = Labels.exact(theta)
-        weight = theta.new_ones(len(theta), dtype=torch.double)
         return cls(
-            theta=theta[:, None], x=x, group=label.group, weight=weight, label=label
+            theta=theta[:, None],
+            x=x,
+            group=groups_of(theta).to(theta.device),
+            weight=theta.new_ones(len(theta), dtype=torch.double),
+            y=theta,
+            std=torch.zeros_like(theta, dtype=torch.double),
         )
 
-    def __len__(self) -> int:
-        return len(self.x)
+    def __add__(self, others: "Pairs") -> "Pairs":
+        """Return these pairs followed by others; draws of measurements are not kept."""
+        if not len(self):
+            return others
+        counts = [one.theta.shape[1] * one.are_drawn for one in (self, others)]
+        if counts[0] != counts[1]:
+            raise InvalidInputError(
+                "Expected labels with as many draws as those appended before, "
+                f"{counts[0]}; got {counts[1]}."
+            )
+        first, second = (
+            vars(one if one.are_drawn else replace(one, theta=one.y[:, None]))
+            for one in (self, others)
+        )
+        return Pairs(**{k: torch.cat([value, second[k]]) for k, value in first.items()})
 
-    def __getitem__(self, rows: Tensor) -> "Pairs":
-        return _map(lambda value: value[rows], self)
+    @property
+    def are_drawn(self) -> bool:
+        """Whether labels are draws, and no measurements."""
+        return bool(torch.isnan(self.std).any())
+
+    @property
+    def is_measured(self) -> Tensor:
+        """Which parameters were measured, exactly or with noise, shape ``(n, d)``."""
+        return ~torch.isnan(self.y + self.std)
+
+    @property
+    def is_exact(self) -> Tensor:
+        """Of which pairs all parameters are known exactly, shape ``(n,)``."""
+        return (self.is_measured & (self.std == 0)).all(dim=1)
 
     @property
     def are_exact(self) -> bool:
-        """Whether all parameters are known exactly."""
-        return self.label.are_exact
+        """Whether all parameters of all pairs are known exactly."""
+        return bool(self.is_exact.all())
+
+    @property
+    def label(self) -> Tensor:
+        """A number for each label, the same for equal labels, shape ``(n,)``."""
+        # NaN is not equal to itself.
+        parts = [self.y.nan_to_num(), self.is_measured, self.std.nan_to_num()]
+        if self.are_drawn:
+            parts.append(self.theta.flatten(1))
+        table = torch.cat([part.double() for part in parts], dim=1)
+        return groups_of(table).to(self.y.device)
 
     @property
     def mean(self) -> Tensor:
         """The mean of the draws of each pair, shape ``(n, d)``."""
-        if self.theta.shape[1] == 1:
-            return self.theta[:, 0]
         return self.theta.double().mean(dim=1).to(self.theta)
 
     @property
@@ -159,40 +136,53 @@ class Pairs:
         _, place, sizes = self.group.unique(return_inverse=True, return_counts=True)
         return self.weight / sizes[place]
 
-    def folds(self, num_folds: int, *, seed: int | None = None) -> list[Tensor]:
-        """Return the rows of each fold, drawn at random. A group is in one fold."""
-        with seeded(seed):
-            rows = split_groups(self.group, num_folds)
-        return [fold.to(self.group.device) for fold in rows]
-
-    def split(
-        self, fraction: float, *, seed: int | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Return the rows to train on, and those held out: whole groups, at random."""
-        with seeded(seed):
-            train, held_out = split_pairs(self.group, fraction)
+    def split(self, fraction: float) -> tuple[Tensor, Tensor]:
+        """Return the rows to train on, and those held out, see :func:`split_pairs`."""
+        train, held_out = split_pairs(self.group, fraction)
         return train.to(self.group.device), held_out.to(self.group.device)
+
+    def folds(self, num_folds: int, *, seed: int | None = None) -> list[Tensor]:
+        """Cut rows into folds of like size at random; a group is in one fold."""
+        # scikit-learn's GroupKFold refuses fewer groups than folds, and in which order
+        # it takes groups of equal size depends on its version.
+        groups = groups_of(self.group)
+        sizes = torch.bincount(groups)
+        with seeded(seed):
+            order = torch.randperm(len(sizes))
+        num_folds = min(num_folds, len(order))
+        if len(order) == len(groups):
+            folds = list(order.tensor_split(num_folds))
+        else:
+            fold_of, num_rows = torch.empty_like(order), [0] * num_folds
+            # The largest first, each to the fold with the fewest rows so far.
+            largest = sizes[order].argsort(descending=True, stable=True)
+            for group in order[largest].tolist():
+                fold = num_rows.index(min(num_rows))
+                fold_of[group] = fold
+                num_rows[fold] += int(sizes[group])
+            rows = fold_of[groups]
+            folds = [(rows == fold).nonzero()[:, 0] for fold in range(num_folds)]
+        return [fold.to(self.group.device) for fold in folds]
 
     def __str__(self) -> str:
         """Say in one sentence what is known about the parameters."""
         text = f"{len(self)} {'exact ' if self.are_exact else ''}labels"
-        if (num_groups := self.num_groups) < len(self):
-            text += f" in {num_groups} groups"
-        if self.label.are_drawn:
-            text += f", each given as {self.label.draws.shape[1]} draws"
+        if self.num_groups < len(self):
+            text += f" in {self.num_groups} groups"
+        if self.are_drawn:
+            text += f", each given as {self.theta.shape[1]} draws"
         elif not self.are_exact:
-            num_noisy = int(self.label.is_noisy.any(dim=1).sum())
-            num_partial = int((~self.label.is_measured).any(dim=1).sum())
+            num_noisy = int((self.std > 0).any(dim=1).sum())
+            num_partial = int((~self.is_measured).any(dim=1).sum())
             text += f", {num_noisy} with noise and {num_partial} partial"
         if (self.weight != 1).any():
-            number, total = effective_number(self.weight), self.weight.sum()
-            text += f", weighted like {number:.1f} of equal weight"
-            text += f", and counted as {float(total):.3g}"
+            text += f", weighted like {effective_number(self.weight):.1f} of equal "
+            text += f"weight, and counted as {float(self.weight.sum()):.3g}"
         return text
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Nodes:
+class Nodes(Rows):
     r"""Parameters and weights that turn a density of theta into one of the label.
 
     .. math:: p(y_i \mid x_i) \approx \frac1S \sum_s u_{is}\, q(\theta_{is} \mid x_i)
@@ -211,12 +201,6 @@ class Nodes:
         """Return the nodes of exact labels ``(n, d)``: the labels themselves."""
         log_weights = theta.new_zeros(len(theta), 1, dtype=torch.double)
         return cls(theta=theta[:, None], log_weights=log_weights)
-
-    def __len__(self) -> int:
-        return len(self.theta)
-
-    def __getitem__(self, rows: Tensor) -> "Nodes":
-        return _map(lambda value: value[rows], self)
 
     def log_mean(self, log_q: Tensor) -> Tensor:
         r"""Return the log density of each label, ``(n,)`` or ``(n, K)``.
@@ -238,17 +222,18 @@ class Nodes:
     def _terms(self, log_q: Tensor) -> Tensor:
         weights = self.log_weights if log_q.ndim == 2 else self.log_weights[..., None]
         # Where the weight is zero, the density may be anything.
-        return torch.where(
-            torch.isneginf(weights), weights, log_q.to(weights) + weights
-        )
+        return weights.where(torch.isneginf(weights), log_q.to(weights) + weights)
 
 
-def groups_of(theta: Tensor) -> Tensor:
-    """Number rows ``(n, d)``, or numbers ``(n,)``, so that equal ones share a number.
+# Groups -------------------------------------------------------------------------------
+
+
+def groups_of(values: Tensor | Sequence[Hashable]) -> Tensor:
+    """Number rows ``(n, d)``, numbers or names, so that equal ones share a number.
 
     Numbers start at 0, in the order of first appearance, on the CPU, shape ``(n,)``.
     """
-    rows = theta.detach().tolist()
+    rows = values.tolist() if isinstance(values, Tensor) else values
     keys = [tuple(row) if isinstance(row, list) else row for row in rows]
     numbers = {key: number for number, key in enumerate(dict.fromkeys(keys))}
     return torch.tensor([numbers[key] for key in keys], dtype=torch.long)
@@ -289,6 +274,9 @@ def one_of_each_group(groups: Tensor, *, seed: int) -> Tensor:
     return chosen
 
 
+# The hold-out set ---------------------------------------------------------------------
+
+
 def split_pairs(
     theta_or_groups: Tensor, validation_fraction: float
 ) -> tuple[Tensor, Tensor]:
@@ -311,25 +299,6 @@ def split_pairs(
     return rows[~held_out], rows[held_out]
 
 
-def split_groups(groups: Tensor, num_folds: int) -> list[Tensor]:
-    """Cut rows into folds of like size at random; a group is in one fold."""
-    # scikit-learn's GroupKFold refuses fewer groups than folds, and in which order it
-    # takes groups of equal size depends on its version.
-    groups = groups_of(groups)
-    sizes = torch.bincount(groups)
-    order = torch.randperm(len(sizes))
-    num_folds = min(num_folds, len(order))
-    if len(order) == len(groups):
-        return list(order.tensor_split(num_folds))
-    fold_of, num_rows = torch.empty_like(order), [0] * num_folds
-    # The largest first, each to the fold with the fewest rows so far.
-    for group in order[sizes[order].argsort(descending=True, stable=True)].tolist():
-        fold = num_rows.index(min(num_rows))
-        fold_of[group] = fold
-        num_rows[fold] += int(sizes[group])
-    return [(fold_of[groups] == fold).nonzero()[:, 0] for fold in range(num_folds)]
-
-
 def groups_to_hold_out(wanted: int, sizes: list[int]) -> list[int]:
     """Choose some groups, in order, with some ``wanted`` rows, or the smallest."""
     chosen, total = [], 0
@@ -342,33 +311,18 @@ def groups_to_hold_out(wanted: int, sizes: list[int]) -> list[int]:
     return chosen[: len(sizes) - 1] or [sizes.index(min(sizes))]
 
 
-def too_few_pairs(theta_or_groups: Tensor) -> str:
-    """Say in words, for a warning, that these pairs are too few to hold some out."""
-    groups = groups_of(theta_or_groups)
-    count, some = len(groups.unique()), f"{len(groups)} calibration pairs"
-    if count == len(groups):
-        return f"Only {some}"
-    return f"Only {count} different parameters (or groups) among {some}"
-
-
-def _map(function: Callable[..., Any], first: Table, *others: Table) -> Table:
-    """Apply a function to each field of dataclasses of one type."""
-    names = [field.name for field in fields(first)]  # type: ignore[arg-type]
-    columns = [[getattr(one, name) for one in (first, *others)] for name in names]
-    return type(first)(**{n: function(*c) for n, c in zip(names, columns, strict=True)})
-
-
 def epochs_on_pairs(
     theta_or_groups: Tensor, held_out: Tensor, max_num_epochs: int
 ) -> int:
     """Return how many epochs to train on pairs for; few, and warn, without hold-out."""
     if len(held_out):
         return max_num_epochs
+    count = int(groups_of(theta_or_groups).max()) + 1
     warn_user(
-        f"{too_few_pairs(theta_or_groups)}: none is held out, and tuning stops after "
-        f"at most {EPOCHS_WITHOUT_HOLDOUT} epochs. Append at least "
-        f"{MIN_PAIRS_FOR_HOLDOUT} pairs of different parameters to choose the best net "
-        "on a hold-out."
+        f"Only {count} different parameters (or groups) among {len(theta_or_groups)} "
+        "calibration pairs: none is held out, and tuning stops after at most "
+        f"{EPOCHS_WITHOUT_HOLDOUT} epochs. Append at least {MIN_PAIRS_FOR_HOLDOUT} "
+        "pairs of different parameters to choose the best net on a hold-out."
     )
     return min(max_num_epochs, EPOCHS_WITHOUT_HOLDOUT)
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, MultivariateNormal
 
+from sbi_rope.data.labels import log_student_t
 from sbi_rope.data.pairs import Pairs
 from sbi_rope.utils.seeds import seeded
 from sbi_rope.utils.tensors import as_batch
@@ -44,33 +45,26 @@ def learn_parameters(
 ) -> ParameterDistribution:
     r"""Weight simulations so that their parameters are distributed like those of pairs.
 
-    Each parameter is replaced by its normal score u under the prior. A continuous prior
-    is then close to the normal distribution :math:`\mathcal N(0, R)`, with R the
-    correlation of the scores. Real parameters are modelled as
+    Each parameter is replaced by its normal score u under the prior, with correlation
+    R. With equal weight before any pair is seen, real parameters follow the prior, or
 
     .. math::
         u \sim \mathcal N(\mu, \Lambda), \quad
         \Lambda \sim \mathrm{IW}(c\, R, c + d + 1), \quad
         \mu \mid \Lambda \sim \mathcal N(0, \Lambda / c),
 
-    averaged over values of c by their evidence, so that the predictive density is a
-    mixture t(u) of Student t densities. The alternative is that real parameters follow
-    the prior, with a probability of one half before any pair is seen and :math:`\pi`
-    afterwards. Simulations from the prior are drawn with probabilities proportional to
+    averaged over values of c by their evidence. With :math:`\pi` the probability of the
+    prior afterwards and t(u) the predictive density, simulations are drawn with
+    probabilities proportional to :math:`\pi + (1 - \pi)\, t(u) / \mathcal N(u; 0, R)`.
 
-    .. math::
-        \pi + (1 - \pi)\, t(u) / \mathcal N(u; 0, R) .
-
-    Discrete parameters, of which more than one in twenty simulations share a value, are
-    left out: they stay distributed as in the prior, given the others. Scores of pairs
-    are cut off where one of twenty sets of pairs from the prior reaches, so that labels
-    on a bound do not count for more with more simulations.
+    Discrete parameters, of which more than one in twenty simulations share a value,
+    stay distributed as in the prior, given the others.
 
     Args:
         theta_cal: Parameters of the pairs, shape ``(n_c, d)``. Equal ones count once,
             because several recordings of one person are one draw from the distribution.
-            Of labels that are not exact, R draws of each, shape ``(n_c, R, d)``. The
-            probabilities are then averages over up to ten sets of draws.
+            Of labels that are not exact, R draws of each, shape ``(n_c, R, d)``, over
+            which the probabilities are averaged.
         theta: Parameters of at least two simulations from the prior, shape ``(n, d)``.
         weights: How many draws from the distribution each pair counts as, shape
             ``(n_c,)``; one if None. The weights of equal parameters are added.
@@ -124,11 +118,10 @@ def _learn(
     correlation = correlation + 1e-6 * torch.eye(len(correlation)).to(u)
     normal = MultivariateNormal(torch.zeros_like(u[0]), correlation)
     fits = [_fit(u_cal, u, counts, correlation, strength) for strength in STRENGTHS]
-    evidence = torch.stack([log_evidence for log_evidence, _ in fits])
+    evidence, log_t = (torch.stack(parts, dim=-1) for parts in zip(*fits, strict=True))
     average = evidence.logsumexp(dim=0) - math.log(len(fits))
     probability = float(torch.sigmoid(counts @ normal.log_prob(u_cal) - average))
-    predictive = torch.stack([log_t for _, log_t in fits], dim=1)
-    log_t = (predictive + evidence.log_softmax(dim=0)).logsumexp(dim=1)
+    log_t = (log_t + evidence.log_softmax(dim=0)).logsumexp(dim=1)
     return probability, torch.softmax(log_t - normal.log_prob(u), dim=0)
 
 
@@ -148,9 +141,7 @@ def normal_scores(theta: Tensor, reference: Tensor) -> Tensor:
 def _fit(
     u_cal: Tensor, u: Tensor, counts: Tensor, correlation: Tensor, strength: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the log evidence at one strength, and the log predictive density at u."""
-    # These are the conjugate formulas for a normal distribution with unknown mean and
-    # covariance.
+    """Return the log evidence of a value of c, and the log predictive density at u."""
     n, d = float(counts.sum()), u_cal.shape[1]
     degrees, scale = strength + d + 1, strength * correlation
     average = counts @ u_cal / n
@@ -169,13 +160,4 @@ def _fit(
     )
     freedom = new_degrees - d + 1
     factor = torch.linalg.cholesky(new_scale * (total + 1) / (total * freedom))
-    centred = (u - n / total * average).T
-    squares = torch.linalg.solve_triangular(factor, centred, upper=False).square()
-    log_t = (
-        math.lgamma((freedom + d) / 2)
-        - math.lgamma(freedom / 2)
-        - d / 2 * math.log(freedom * math.pi)
-        - factor.diagonal().log().sum()
-        - (freedom + d) / 2 * torch.log1p(squares.sum(dim=0) / freedom)
-    )
-    return log_evidence, log_t
+    return log_evidence, log_student_t(u, n / total * average, factor, freedom)

@@ -12,7 +12,7 @@ from scipy.stats import kstest
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_rope.data.pairs import Pairs
+from sbi_rope.data.pairs import Pairs, Rows
 from sbi_rope.npe.prior import check_in_support
 from sbi_rope.utils.errors import InvalidInputError, SimulationError, warn_user
 from sbi_rope.utils.progress import progress_bar
@@ -23,21 +23,22 @@ from sbi_rope.utils.tensors import as_batch, as_numbers, divisors
 Embed = Callable[[Tensor], Tensor]
 # Tells which simulations an embedding net can read, ``(n, *event)`` to ``(n,)``.
 Readable = Callable[[Tensor], Tensor]
-# Simulations ``(n, *event)`` with NaN where the simulator raised, and its first error.
-Result = tuple[Tensor, Exception | None]
+# Simulations ``(n, *event)``, NaN where the simulator raised, and its first error.
+Result = tuple[Tensor, str]
 
 # A simulator may fail at some parameters, so that it is tried at so many.
 TRIES = 5
-# Rows that are simulated before they are embedded: in batches, one by one, and one by
-# one in workers. A worker gets so many rows of a batch.
-BATCHED_CHUNK, SINGLE_CHUNK, PARALLEL_CHUNK, ROWS_OF_WORKER = 1000, 10, 100, 100
+# Rows that are simulated before they are embedded, in batches and one by one, and those
+# of a batch that a worker gets.
+BATCHED_CHUNK, SINGLE_CHUNK, ROWS_OF_WORKER = 1000, 100, 100
 # A progress bar appears after this many seconds.
 DELAY = 2.0
 # The most numbers in simulations that are kept, in distances that are computed at once,
 # and in the simulations that planes are fitted to at once.
 MAX_KEPT, MAX_DISTANCES, MAX_NUMBERS = 2**27, 50_000_000, 2**24
-# The plane at a theta is fitted to so many stored simulations, at least.
-NUM_AROUND = 50
+# The fewest stored simulations that a plane is fitted to, and the ridge that keeps it
+# level where parameters do not vary.
+NUM_AROUND, LEVEL = 50, 1e-6
 # Draws of the prior that stored parameters are compared with, and the p-value below
 # which they differ.
 NUM_FROM_PRIOR, NOT_FROM_PRIOR = 10_000, 1e-6
@@ -49,10 +50,6 @@ SIMULATIONS_PER_COEFFICIENT, RIDGE = 3, 1e-4
 def all_finite(x: Tensor) -> Tensor:
     """Tell which rows are finite, which is what most embedding nets can read."""
     return torch.isfinite(x).flatten(1).all(dim=1)
-
-
-def _itself(x: Tensor) -> Tensor:
-    return x
 
 
 # A user's simulator -------------------------------------------------------------------
@@ -103,7 +100,6 @@ class _Way:
     function: Callable[[Any], Any]
     batched: bool
     kind: str
-    event_shape: torch.Size
     like: Tensor
 
     def x_of(self, theta: Tensor) -> Tensor:
@@ -117,7 +113,7 @@ class _Way:
         if self.kind == "tensor to tensor" and not isinstance(result, Tensor):
             raise SimulationError("A tensor gave something else than a tensor.")
         x = as_numbers("simulator(theta)", result)
-        expected = (*theta.shape[:-1], *self.event_shape)
+        expected = (*theta.shape[:-1], *self.like.shape[1:])
         if [n for n in x.shape if n != 1] != [n for n in expected if n != 1]:
             raise SimulationError(
                 f"Expected `simulator` to return x of shape {expected} for theta of "
@@ -125,34 +121,28 @@ class _Way:
             )
         return x.reshape(expected).to(self.like, copy=True)
 
-    def simulate(self, theta: Tensor) -> Result:
+    def simulate(self, theta: Tensor, seed: int | None = None) -> Result:
         """Simulate theta ``(n, d)``; if a batch raises, its rows one by one."""
-        error, rows = None, []
-        if self.batched:
-            try:
-                return self.x_of(theta), None
-            except Exception as raised:  # of any type
-                error = raised
-        for one in theta.split(1) if self.batched else theta:
-            try:
-                rows.append(self.x_of(one).reshape(self.event_shape))
-            except Exception as raised:
-                error = error or raised
-                rows.append(self.like.new_full(self.event_shape, torch.nan))
-        return torch.stack(rows), error
-
-    def simulate_in_worker(self, theta: Tensor, seed: int) -> Result:
-        """Simulate, and return an error that can be sent to another process."""
+        x, error = self.like.new_full((len(theta), *self.like.shape[1:]), torch.nan), ""
         with seeded(seed):
-            x, error = self.simulate(theta)
-        return x, error and SimulationError(f"{type(error).__name__}: {error}")
+            if self.batched:
+                try:
+                    return self.x_of(theta), error
+                except Exception as raised:  # of any type
+                    error = repr(raised)
+            for row, one in enumerate(theta.split(1) if self.batched else theta):
+                try:
+                    x[row] = self.x_of(one).reshape(x.shape[1:])
+                except Exception as raised:
+                    error = error or repr(raised)
+        return x, error
 
 
 class Simulated:
     """A user's simulator, called in the first way in which it returns the right shape.
 
-    Simulations that are not ``readable`` are dropped, counted and warned of. The others
-    have the ``event_shape``, and the dtype and device of ``like``.
+    Simulations that are not ``readable`` are dropped, counted and warned of. Others are
+    like the empty batch ``like``, in shape, dtype and device.
     """
 
     def __init__(
@@ -160,168 +150,126 @@ class Simulated:
         function: Callable[[Any], Any],
         prior: Distribution,
         *,
-        event_shape: torch.Size,
         like: Tensor,
         readable: Readable = all_finite,
     ) -> None:
         check("simulator", function, Callable)
-        self._num_workers: int | None = None
+        self._num_workers = 0
         if isinstance(function, ParallelSimulator):
             self._num_workers, function = function.num_workers, function.simulator
-        self._prior, self._event_shape, self._like = prior, event_shape, like
-        self._readable = readable
+        self._prior, self._like, self._readable = prior, like, readable
         self.num_dropped = self.num_calls = 0
         self._kept: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
         # With a seed of its own, so that no result depends on it.
         with seeded(0):
             self._way = self._working_way(function)
 
-    def __call__(self, theta: Tensor) -> Tensor:
-        """Simulate, theta ``(n, d)`` to x ``(n, *event)``; x may contain NaN."""
-        return self._simulate(theta)[0]
-
     def from_prior(
-        self,
-        n: int,
-        embed: Embed = _itself,
-        *,
-        seed: int | None = None,
-        progress: bool = False,
-        finished: list[Result] | None = None,
+        self, n: int, *, seed: int | None = None, progress: bool = False
     ) -> tuple[Tensor, Tensor]:
-        """Return n parameters from the prior, and embeddings of their simulations.
+        """Return n parameters from the prior, and a simulation of each.
 
-        With a seed they are simulated once and kept, as many as memory allows. Parts
-        that are ``finished`` are not simulated again, and others are added to them.
+        With a seed they are simulated once and kept, as many as memory allows.
         """
         if seed is None:
             theta = self._prior.sample(torch.Size((n,))).to(self._like)
-            embedded, ok = self._embedded(
-                theta, embed, "from the prior", progress=progress, finished=finished
+            x, ok = self._embedded(
+                theta, lambda x: x, "from the prior", progress=progress
             )
-            return theta[ok], embedded[ok]
-        n = min(n, max(1, MAX_KEPT // self._event_shape.numel()))
+            return theta[ok], x[ok]
+        n = min(n, max(1, MAX_KEPT // self._like.shape[1:].numel()))
         if (n, seed) not in self._kept:
             with seeded(seed):
                 self._kept[n, seed] = self.from_prior(n, progress=progress)
-        theta, x = self._kept[n, seed]
-        return theta, embed(x)
+        return self._kept[n, seed]
 
     def at(self, theta: Tensor, embed: Embed, *, progress: bool = False) -> Tensor:
         """Simulate at parameters of n pairs, ``(n, S, d)`` to ``(n, S, l)``.
 
         Embeddings of simulations that failed are NaN.
         """
-        embedded, valid = self._embedded(
+        z, ok = self._embedded(
             theta.flatten(0, 1), embed, "at calibration parameters", progress=progress
         )
-        empty = ~valid.reshape(theta.shape[:2]).any(dim=1)
+        empty = ~ok.reshape(theta.shape[:2]).any(dim=1)
         if empty.any():
             # Row numbers would mislead, because these may be some of the pairs only.
-            first = theta[empty].mean(dim=1)[:5].tolist()
-            digits = [[float(f"{number:.4g}") for number in row] for row in first]
             raise SimulationError(
-                f"All simulations at the calibration parameters {digits} failed. "
-                "Remove these pairs."
+                "All simulations at the calibration parameters "
+                f"{theta[empty].mean(dim=1)[:5].tolist()} failed. Remove these pairs."
             )
-        embedded = embedded.where(valid[:, None], torch.nan)
-        return embedded.reshape(*theta.shape[:2], -1)
+        return z.where(ok[:, None], torch.nan).reshape(*theta.shape[:2], -1)
 
     def _working_way(self, function: Callable[[Any], Any]) -> _Way:
         """Try batches before single parameters, and tensors before arrays."""
-        sizes = {*self._prior.event_shape, *self._event_shape}
+        event_shape = tuple(self._like.shape[1:])
+        sizes = {*self._prior.event_shape, *event_shape}
         # A number of rows that is no number of parameters or of readings.
         num_rows = next(n for n in range(3, 4 + len(sizes)) if n not in sizes)
         kinds = ("tensor to tensor", "array", "tensor")
         thetas = self._prior.sample(torch.Size((TRIES,))).to(self._like)
         errors: dict[Any, Exception] = {}
         for theta, batched, kind in itertools.product(thetas, (True, False), kinds):
-            way = _Way(function, batched, kind, self._event_shape, self._like)
+            way = _Way(function, batched, kind, self._like)
             given = theta.repeat(num_rows, 1) if batched else theta
-            rows = num_rows if batched else 1
-            self.num_calls += rows
             try:
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore")  # NumPy warns of tensors
                     x = way.x_of(given)
-                    if batched and bool((x == x[0]).all()):
-                        self.num_calls += rows
-                        # Written for one theta, it may add one noise to all rows.
-                        if not torch.equal(way.simulate(given)[0], x):
-                            raise SimulationError("All rows have the same noise.")
+                    is_repeated = batched and bool((x == x[0]).all())
+                    # Written for one theta, it may add one noise to all rows.
+                    if is_repeated and not torch.equal(way.x_of(given), x):
+                        raise SimulationError("All rows have the same noise.")
                 return way
             except Exception as raised:  # any error of the user's code
                 errors[batched, kind] = raised
         of_array = errors[False, "array"]
         raise SimulationError(
             "Expected `simulator` to map theta (n, d) to x (n, *event), or one (d,) to "
-            f"one (*event), where *event is {tuple(self._event_shape)}; a batch of "
-            f"tensors gave {errors[True, 'tensor']!r}, and one array {of_array!r}."
+            f"one (*event), where *event is {event_shape}; a batch of tensors gave "
+            f"{errors[True, 'tensor']!r}, and one array {of_array!r}."
         ) from of_array
 
     def _embedded(
-        self,
-        theta: Tensor,
-        embed: Embed,
-        where: str,
-        *,
-        progress: bool,
-        finished: list[Result] | None = None,
+        self, theta: Tensor, embed: Embed, where: str, *, progress: bool
     ) -> tuple[Tensor, Tensor]:
         """Return embeddings ``(n, l)`` of simulations, and which of them are finite."""
-        embeddings, valid, error = [], [], None
-        chunk = PARALLEL_CHUNK if self._num_workers else SINGLE_CHUNK
-        parts = theta.split(BATCHED_CHUNK if self._way.batched else chunk)
+        embeddings, valid, first_error = [], [], ""
+        size = BATCHED_CHUNK if self._way.batched else SINGLE_CHUNK
         label = f"Calling the simulator {len(theta):,} times"
-        with progress_bar(
-            show=progress, desc=label, total=len(theta), delay=DELAY
-        ) as bar:
-            for number, part in enumerate(parts):
-                if finished is None:
-                    x, raised = self._simulate(part)
-                else:
-                    # With a seed of its own, no part depends on where a call was
-                    # interrupted. Seed 0 is that of theta.
-                    if number == len(finished):
-                        with seeded(number + 1):
-                            finished.append(self._simulate(part))
-                    x, raised = finished[number]
+        options = {"desc": label, "total": len(theta), "delay": DELAY}
+        with progress_bar(show=progress, **options) as bar:
+            for part in theta.split(size):
+                x, error = self.simulate(part)
                 bar.update(len(part))
-                error = error or raised
+                first_error = first_error or error
                 ok = self._readable(x)
                 # Embedding nets may raise on NaN. They get zeros instead.
-                embedded = embed(x.where(ok.reshape(-1, *[1] * (x.ndim - 1)), 0.0))
-                embeddings.append(embedded)
+                z = embed(x.where(ok.reshape(-1, *[1] * (x.ndim - 1)), 0.0))
+                embeddings.append(z)
                 # An embedding can overflow where x does not. Missing entries that the
                 # net can read are fine.
-                valid.append(ok & (all_finite(embedded) | ~all_finite(x)))
+                valid.append(ok & (all_finite(z) | ~all_finite(x)))
         ok = torch.cat(valid)
-        because = "" if error is None else f" The simulator raised {error!r}."
+        because = f" The simulator raised {first_error}." if first_error else ""
         if not ok.any():
             raise SimulationError(
                 f"All {len(ok)} simulations {where} are not finite.{because}"
-            ) from error
+            )
         self.num_dropped += _warn_of_dropped(ok, f"simulations {where}", because)
         return torch.cat(embeddings), ok
 
-    def _simulate(self, theta: Tensor) -> Result:
-        """Simulate rows, in this process or in workers, and count them."""
-        pieces = [theta]
-        if self._num_workers is None:
-            results = [self._way.simulate(theta)]
-        else:
-            pieces = theta.split(ROWS_OF_WORKER if self._way.batched else 1)
-            seeds = torch.randint(2**31, (len(pieces),)).tolist()
-            run: Any = joblib.Parallel(n_jobs=self._num_workers, backend="loky")
-            results = run(
-                joblib.delayed(self._way.simulate_in_worker)(piece, seed)
-                for piece, seed in zip(pieces, seeds, strict=True)
-            )
-        for piece, (_, error) in zip(pieces, results, strict=True):
-            again = self._way.batched and error is not None
-            self.num_calls += len(piece) * (2 if again else 1)
+    def simulate(self, theta: Tensor) -> Result:
+        """Simulate theta ``(n, d)``, in this process or in workers, and count rows."""
+        self.num_calls += len(theta)
+        if not self._num_workers:
+            return self._way.simulate(theta)
+        pieces = theta.split(ROWS_OF_WORKER if self._way.batched else 1)
+        seeds = torch.randint(2**31, (len(pieces),)).tolist()
+        run: Any = joblib.Parallel(n_jobs=self._num_workers, backend="loky")
+        results = run(map(joblib.delayed(self._way.simulate), pieces, seeds))
         xs, errors = zip(*results, strict=True)
-        return torch.cat(xs), next(filter(None, errors), None)
+        return torch.cat(xs), next(filter(None, errors), "")
 
 
 def _warn_of_dropped(ok: Tensor, what: str, because: str = "") -> int:
@@ -346,35 +294,26 @@ class Stored:
         self._pairs: tuple[Tensor, Tensor] | None = (theta, x)
 
     def from_prior(
-        self,
-        n: int,
-        embed: Embed = _itself,
-        *,
-        seed: int | None = None,
-        progress: bool = False,
+        self, n: int, *, seed: int | None = None, progress: bool = False
     ) -> tuple[Tensor, Tensor]:
         """Return up to n pairs, chosen at random."""
         theta, x = self._all(progress=progress)
         with seeded(seed):
             chosen = torch.randperm(len(x))[:n].to(x.device)
-        return theta[chosen], embed(x[chosen])
+        return theta[chosen], x[chosen]
 
     def at(self, theta: Tensor, embed: Embed, *, progress: bool = False) -> Tensor:
         r"""Return stored simulations near the parameters, moved to them.
 
-        A plane is fitted to the embeddings z of the K simulations nearest to theta: 50
-        or, with many parameters, five for each coefficient. Simulations are moved along
-        the plane from their own parameters to theta (regression adjustment),
+        A plane is fitted to the embeddings z of the K nearest simulations: 50 or, with
+        many parameters, five for each coefficient. These are moved along it to theta,
 
         .. math:: z(\theta) + c\, r_k, \qquad c^2 = (K - 1) / (K - d - 1),
 
         where c makes up for what the plane takes from the residuals r. The s-th theta
         of a pair takes the s-th nearest simulation, so that residuals do not repeat.
 
-        References:
-            | Approximate Bayesian Computation in Population Genetics (Beaumont et al.,
-              2002)
-            | https://doi.org/10.1093/genetics/162.4.2025
+        Source: regression adjustment, https://doi.org/10.1093/genetics/162.4.2025.
         """
         stored, x = self._all(progress=progress)
         n, count, d = theta.shape
@@ -385,16 +324,14 @@ class Stored:
         used, row = nearest.unique(return_inverse=True)
         z = torch.cat([embed(x[some]) for some in used.split(BATCHED_CHUNK)])
         turn = (torch.arange(count) % number).repeat(n).to(place)
-        # The ridge keeps the plane level where parameters do not vary.
-        ridge = torch.full((d + 1,), 1e-6).to(at).double()
-        ridge[0] = 0.0
+        ridge = torch.tensor([0.0] + [LEVEL] * d).to(at).double().diag()
         scale = ((number - 1) / max(1, number - d - 1)) ** 0.5
         chunk, moved = max(1, MAX_NUMBERS // (number * z[0].numel())), []
         for of, k in zip(place.split(chunk), turn.split(chunk), strict=True):
             offsets = stored[nearest[of]].double() - at[of].double()[:, None]
             design = torch.cat([torch.ones_like(offsets[..., :1]), offsets], dim=-1)
             around = z[row[of]].double()
-            normal = design.mT @ design + ridge.diag()
+            normal = design.mT @ design + ridge
             plane = torch.linalg.solve(normal, design.mT @ around)
             each = torch.arange(len(of)).to(of)
             residual = around[each, k] - (design[each, None, k] @ plane)[:, 0]
@@ -419,27 +356,14 @@ class Budget(Stored):
 
     def __init__(self, simulated: Simulated, n: int) -> None:
         self._simulated, self._n, self._pairs = simulated, n, None
-        # If that is interrupted, the next call goes on where it was.
-        self._finished: list[Result] = []
-
-    @property
-    def num_calls(self) -> int:  # type: ignore[override]
-        """How many rows were simulated so far."""
-        return self._simulated.num_calls
-
-    @property
-    def num_dropped(self) -> int:  # type: ignore[override]
-        """How many simulations were not finite."""
-        return self._simulated.num_dropped
 
     def _all(self, *, progress: bool) -> tuple[Tensor, Tensor]:
         if self._pairs is None:
             # With a seed of their own, they do not depend on who asks first.
             with seeded(0):
-                self._pairs = self._simulated.from_prior(
-                    self._n, finished=self._finished, progress=progress
-                )
-            self._finished = []
+                self._pairs = self._simulated.from_prior(self._n, progress=progress)
+            self.num_calls = self._simulated.num_calls
+            self.num_dropped = self._simulated.num_dropped
         return self._pairs
 
 
@@ -467,7 +391,6 @@ def source_of(
     simulator: Any,
     simulations: Any,
     num_simulations: int | None = None,
-    event_shape: torch.Size,
     like: Tensor,
     readable: Readable = all_finite,
 ) -> Source:
@@ -479,33 +402,29 @@ def source_of(
             f"{'none' if simulator is None else 'both'}."
         )
     if simulations is None:
-        source = Simulated(
-            simulator, prior, event_shape=event_shape, like=like, readable=readable
-        )
+        source = Simulated(simulator, prior, like=like, readable=readable)
         return source if num_simulations is None else Budget(source, num_simulations)
     if num_simulations is not None:
         raise InvalidInputError("Expected `num_simulations` with a simulator only.")
     theta, x = simulations
     options: Any = {"device": like.device, "finite": False}
-    theta = as_batch("simulations[0]", theta, prior.event_shape, **options)
-    x = as_batch("simulations[1]", x, event_shape, rows=len(theta), **options)
-    theta, x = theta.to(like), x.to(like)
-    valid = torch.isfinite(theta).all(dim=1) & readable(x)
+    theta = as_batch("simulations[0]", theta, prior.event_shape, **options).to(like)
+    x = as_batch("simulations[1]", x, like.shape[1:], rows=len(theta), **options)
+    valid = torch.isfinite(theta).all(dim=1) & readable(x.to(like))
     if not valid.any():
         raise SimulationError("All stored simulations contain NaN or Inf.")
-    theta, x = theta[valid], x[valid]
-    stored = Stored(theta, x)
-    stored.num_dropped = _warn_of_dropped(valid, "stored simulations")
-    check_in_support("simulations[0]", theta, prior)
+    check_in_support("simulations[0]", theta[valid], prior)
     with seeded(0):
         drawn = prior.sample(torch.Size((NUM_FROM_PRIOR,)))
-    columns = zip(theta.T.cpu().numpy(), drawn.T.cpu().numpy(), strict=True)
+    columns = zip(theta[valid].T.cpu().numpy(), drawn.T.cpu().numpy(), strict=True)
     p_values = [kstest(*both, method="asymp").pvalue for both in columns]
     if unlike := [k for k, p in enumerate(p_values) if p < NOT_FROM_PRIOR]:
         warn_user(
             f"The parameters {unlike} of `simulations` (counted from 0) are not "
             "distributed like the prior, as whose draws they are used."
         )
+    stored = Stored(theta[valid], x[valid].to(like))
+    stored.num_dropped = _warn_of_dropped(valid, "stored simulations")
     return stored
 
 
@@ -513,8 +432,8 @@ def source_of(
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Moments:
-    """Means and covariance of the embeddings of simulations at the parameters of pairs.
+class Moments(Rows):
+    """The moments of embeddings of simulations at the parameters of pairs.
 
     Attributes:
         means: Means at R parameters that the label of each pair leaves possible, shape
@@ -530,14 +449,11 @@ class Moments:
         """The mean over the possible parameters, shape ``(n, l)``."""
         return self.means.mean(dim=1)
 
-    def __getitem__(self, rows: Tensor) -> "Moments":
-        return Moments(means=self.means[rows], covariance=self.covariance[rows])
-
     def columns(self, columns: slice) -> "Moments":
         """Return the moments of some entries of the embeddings."""
+        means, covariance = self.means, self.covariance
         return Moments(
-            means=self.means[..., columns],
-            covariance=self.covariance[:, columns, columns],
+            means=means[..., columns], covariance=covariance[:, columns, columns]
         )
 
 
@@ -549,19 +465,15 @@ def draws(
     Return parameters ``(n, S, d)`` and embeddings ``(n, S, l)``. A simulation that
     failed is replaced by another one of the pair.
     """
-    theta = pairs.theta
-    if theta.shape[1] == 1:
-        theta = theta.expand(-1, count, -1)
+    theta = pairs.theta.repeat(1, -(-count // pairs.theta.shape[1]), 1)
     z = source.at(theta, embed, progress=progress)
-    failed = z.isnan().all(dim=2)
-    if not failed.any():
+    is_there = ~z.isnan().all(dim=2)
+    if is_there.all():
         return theta, z
     # The k-th that failed is replaced by the k-th that is there.
-    usable = failed.int().argsort(dim=1, stable=True)
-    place = (failed.cumsum(dim=1) - 1).clamp_min(0)
-    place = place % (~failed).sum(dim=1, keepdim=True)
-    own = torch.arange(failed.shape[1], device=z.device).expand(failed.shape)
-    chosen = own.where(~failed, usable.gather(1, place))[..., None]
+    rows = (~is_there).int().argsort(dim=1, stable=True)
+    k = is_there.cumsum(dim=1).where(is_there, (~is_there).cumsum(dim=1)) - 1
+    chosen = rows.gather(1, k % is_there.sum(dim=1, keepdim=True))[..., None]
     return theta.take_along_dim(chosen, 1), z.take_along_dim(chosen, 1)
 
 
@@ -591,32 +503,24 @@ def moments(
 ) -> Moments:
     r"""Return the moments of simulations at the parameters of each pair.
 
-    At exact parameters these are the moments of ``count`` simulations. Otherwise one
-    simulation is made at each draw of a label, and a surface is fitted to them, linear
-    or, with enough draws, quadratic. Its values at the draws are the possible means.
-    The covariance is that of the residuals.
-
-    A surface also fits the noise of the simulations. Its linear and its quadratic terms
-    are shrunk by how much of their size is noise, as James and Stein did.
-
-    References:
-        | Estimation with Quadratic Loss (James and Stein, 1961)
-        | https://projecteuclid.org/euclid.bsmsp/1200512173
+    At exact parameters these are the moments of ``count`` simulations. Otherwise a
+    surface is fitted to simulations at the draws of a label, linear or, with enough
+    draws, quadratic. Its values at the draws are the possible means, and the covariance
+    is that of the residuals. Its linear and its quadratic terms are shrunk by how much
+    of their size is noise (James and Stein, Estimation with Quadratic Loss, 1961).
     """
     theta, simulated = draws(source, pairs, count, embed, progress=progress)
     simulated = simulated.double()
-    level = simulated.mean(dim=1, keepdim=True)
-    residual = simulated - level
+    means = simulated.mean(dim=1, keepdim=True)
+    residual = simulated - means
     freedom = simulated.new_full((len(theta),), theta.shape[1] - 1)
     fits = []
     for terms in [] if pairs.theta.shape[1] == 1 else _features(theta.double()):
         fitted, used = _regressed(residual, terms)
-        residual = residual - fitted
-        freedom = freedom - used
+        residual, freedom = residual - fitted, freedom - used
         fits.append((fitted, used))
     covariance = residual.mT @ residual / freedom.clamp_min(1.0)[:, None, None]
     noise = covariance.mean(dim=0).diagonal()
-    means = level
     for fitted, used in fits:
         squares = fitted.square().sum(dim=1)
         kept = 1 - used[:, None] * noise / squares.clamp_min(1e-300)
@@ -634,11 +538,10 @@ def _features(theta: Tensor) -> list[Tensor]:
     std = centred.square().mean(dim=1, keepdim=True).sqrt()
     scale = theta.abs().amax(dim=1, keepdim=True).clamp_min(1e-30)
     linear = torch.where(std > 1e-6 * scale, centred / std.clamp_min(1e-30), 0.0)
-    d = theta.shape[2]
-    num_terms = d + d * (d + 1) // 2
+    first, second = torch.triu_indices(*[theta.shape[2]] * 2).to(theta.device)
+    num_terms = theta.shape[2] + len(first)
     if num_terms * SIMULATIONS_PER_COEFFICIENT > theta.shape[1]:
         return [linear]
-    first, second = torch.triu_indices(d, d).to(theta.device)
     quadratic = linear[..., first] * linear[..., second]
     quadratic = quadratic - quadratic.mean(dim=1, keepdim=True)
     return [linear, quadratic - _regressed(quadratic, linear)[0]]

@@ -350,8 +350,7 @@ class Method(ABC):
             self._prior,
             simulator=self._simulator,
             simulations=self._looked_up,
-            event_shape=self._data.event_shape or torch.Size(),
-            like=torch.empty(0, *self._prior.event_shape, device=self._device),
+            like=torch.empty(0, *self._data.event_shape or (), device=self._device),
             readable=self._data.readable,
         )
 

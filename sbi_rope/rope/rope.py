@@ -3,21 +3,15 @@
 import copy
 import itertools
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
 from sbi_rope.coupling import Coupling, SinkhornCoupler
-from sbi_rope.data.labels import (
-    draws_of,
-    given_groups,
-    given_labels,
-    given_weights,
-    on_bounds,
-)
-from sbi_rope.data.pairs import Pairs, effective_number
+from sbi_rope.data.labels import draws_of, given_groups, given_labels, given_weights
+from sbi_rope.data.pairs import Pairs, effective_number, groups_of
 from sbi_rope.data.parameters import is_improbable, probability_of_prior
 from sbi_rope.data.simulate import Source, moments, source_of, targets
 from sbi_rope.density import Coupled, MixturePosterior
@@ -180,17 +174,16 @@ class RoPE:
             simulations = (as_numbers("theta", theta, names=parameter_names), x)
         self._npe = TrainedNPE(posterior, parameter_names)
         self._npe.x_names = x_names
+        x_like = self._npe.like.new_empty(0, *self._npe.event_shape)
         self.source: Source = source_of(
             self._npe.prior,
             simulator=simulator,
             simulations=simulations,
             num_simulations=num_simulations,
-            event_shape=self._npe.event_shape,
-            like=self._npe.like,
+            like=x_like,
             readable=self._npe.readable,
         )
-        x = self._npe.like.new_empty(0, *self._npe.event_shape)
-        self.pairs = Pairs.exact(self._npe.like, x)
+        self.pairs = Pairs.exact(self._npe.like, x_like)
         self._names: tuple[Hashable, ...] = ()
         self._g: nn.Module | None = None
         self._prior_is_compared = False
@@ -202,14 +195,13 @@ class RoPE:
         x: Tensor,
         *,
         theta_std: Tensor | float | None = None,
-        theta_cov: Tensor | None = None,
         weights: Tensor | None = None,
         groups: Tensor | Sequence[int | str] | None = None,
     ) -> "RoPE":
         r"""Add real observations with known parameters to those appended so far.
 
         Labels need not be exact. A label is then a measurement
-        :math:`y \sim \mathcal N(\theta, R)` of some or all of the parameters.
+        :math:`y_j \sim \mathcal N(\theta_j, \sigma_j^2)` of some or all parameters.
         Whatever needs the parameters is averaged over :math:`p(\theta \mid y)` under
         the prior.
 
@@ -226,8 +218,6 @@ class RoPE:
             theta_std: The standard deviations of the measurements, in the units of
                 theta: a number, or shape ``(d,)`` or ``(n, d)``. Zero is exact. A label
                 with noise may be outside the prior's support. None if all are exact.
-            theta_cov: Instead of ``theta_std``, the covariance of the measurements,
-                shape ``(d, d)`` or ``(n, d, d)``.
             weights: How many pairs each pair counts as, shape ``(n,)``; one if None.
             groups: A number or a name for each pair. Pairs of one group are recordings
                 of one person or specimen. They are held out together, and count once
@@ -243,27 +233,24 @@ class RoPE:
                 discrete.
         """
         names = self.parameter_names or column_names(theta)
-        label = given_labels(
-            theta,
-            theta_std=theta_std,
-            theta_cov=theta_cov,
-            like=self._npe.like,
-            prior=self._npe.prior,
-            names=names,
+        draws, y, std = given_labels(
+            theta, theta_std, like=self._npe.like, prior=self._npe.prior, names=names
         )
-        weight = given_weights(weights, len(label), self._npe.like.device)
-        of_rows = given_groups(groups, len(label))
+        weight = given_weights(weights, len(y), y.device)
+        of_rows = given_groups(groups, len(y))
         x_names = self.x_names or column_names(x)
         x = self._npe.as_x("x", x)
-        check_same_length(label.y, x)
-        if self._npe.is_mixed and not label.are_exact:
+        check_same_length(y, x)
+        rows = torch.arange(len(y), device=y.device)
+        new = Pairs(theta=draws, x=x, group=rows, weight=weight, y=y, std=std)
+        if self._npe.is_mixed and not new.are_exact:
             raise UnsupportedPosteriorError(
                 "Expected exact labels, because some parameters are discrete (MNPE); "
                 "got others."
             )
         self._npe.embed("x", x, self._npe.h)
         warn_of_far_entries("x", x, self._npe.h)
-        known = label.is_measured.any(dim=1)
+        known = ~torch.isnan(y).all(dim=1)
         if not known.any():
             raise InvalidInputError(
                 "Expected labels of at least one parameter in one pair; got NaN only."
@@ -273,34 +260,20 @@ class RoPE:
                 "Labels that say nothing about any parameter are left out: "
                 f"{rows_with(~known)}."
             )
-            label, weight, x = label[known], weight[known], x[known]
-            of_rows = tuple(itertools.compress(of_rows, known.tolist()))
+            new, of_rows = new[known], tuple(itertools.compress(of_rows, known))
         if len(self.pairs) and bool(self._names) != bool(of_rows):
             raise InvalidInputError(
                 "Expected `groups` of all calibration pairs, or of none; got some."
             )
-        label, of_rows = self.pairs.label + label, self._names + of_rows
-        group = label.group
-        if of_rows:
-            numbers = {name: k for k, name in enumerate(dict.fromkeys(of_rows))}
-            group = torch.tensor([numbers[name] for name in of_rows]).to(group)
-        pairs = Pairs(
-            theta=draws_of(label, self._npe.prior),
-            x=torch.cat([self.pairs.x, x]),
-            group=group,
-            weight=torch.cat([self.pairs.weight, weight]),
-            label=label,
-        )
+        pairs, of_rows = self.pairs + new, self._names + of_rows
+        group = groups_of(of_rows).to(y.device) if of_rows else pairs.label
+        theta = draws_of(pairs, self._npe.prior)
+        pairs = replace(pairs, theta=theta, group=group)
         total = float(pairs.weight.sum())
         if total < effective_number(pairs.weight) / 2:
             warn_user(
                 f"The weights of {len(pairs)} pairs sum to {total:.3g}, and all "
                 "together count as so many pairs; do not normalise them."
-            )
-        if found := on_bounds(label, self._npe.prior, names):
-            warn_user(
-                f"{', '.join(found)} lie exactly on the prior's bound; if they are "
-                "censored, pass theta_std."
             )
         self.pairs, self._names = pairs, of_rows
         self._npe.parameter_names, self._npe.x_names = names, x_names
@@ -413,9 +386,9 @@ class RoPE:
         with seeded(seed):
             theta, simulated = self.source.from_prior(
                 num_simulations or max(len(x_o), MIN_SIMULATIONS),
-                self._embed_simulations,
                 progress=is_shown(show_progress_bars),
             )
+        simulated = self._embed_simulations(simulated)
         return EmbeddedBatch(x_o, real, theta, simulated, self._npe, net)
 
     def build_posterior(
@@ -550,10 +523,10 @@ class RoPE:
     def num_simulator_calls(self) -> int:
         """How many rows of theta the simulator has simulated so far.
 
-        A few are simulated when RoPE is constructed, 100 for each label by
-        :meth:`train` (and 2000 with rehearsal), ``max(n_o, 1000)`` for each batch by
-        :meth:`build_posterior`, and by :func:`~sbi_rope.stack` 10,000 from the prior
-        and 100 for each label.
+        These are 100 for each label by :meth:`train` (and 2000 with rehearsal),
+        ``max(n_o, 1000)`` for each batch by :meth:`build_posterior`, and by
+        :func:`~sbi_rope.stack` 10,000 from the prior and 100 for each label. A few at
+        the start, by which RoPE finds out how to call the simulator, do not count.
         """
         return self.source.num_calls
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from sbi_rope.data.labels import nodes_of, reference_of
+from sbi_rope.data.labels import nodes_of
 from sbi_rope.data.pairs import Nodes
 from sbi_rope.data.simulate import Moments, moments
 from sbi_rope.density.base import Density
@@ -62,7 +62,7 @@ class StackData:
         self.estimator, self.source = estimator_of(self.npe), rope.source
         self.prior, self.pairs = PriorDistribution(self.npe.prior), rope.pairs
         self.model = DiscrepancyModel()
-        labels = len(self.pairs.label.group.unique())
+        labels = len(self.pairs.label.unique())
         if (count := min(self.pairs.num_groups, labels)) < 2:
             raise NotReadyError(
                 "Expected at least 2 calibration pairs with different parameters and "
@@ -220,10 +220,7 @@ class StackData:
         with seeded(self.seed_of(rows)):
             samples = start.sample(torch.Size((NUM_SAMPLES,)), self.pairs.x[rows])
             found = nodes_of(
-                self.pairs.label[rows],
-                [reference_of(samples)],
-                self.prior,
-                num_nodes=NUM_NODES,
+                self.pairs[rows], [samples], self.prior, num_nodes=NUM_NODES
             )
         theta = found.theta[:1].expand(len(self), -1, -1).clone()
         log_weights = found.log_weights[:1].expand(len(self), -1).clone()

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from sbi_rope.data.labels import nodes_of, reference_of
-from sbi_rope.data.pairs import Labels, Nodes, groups_of, one_of_each_group
+from sbi_rope.data.labels import nodes_of
+from sbi_rope.data.pairs import Nodes, Pairs, groups_of, one_of_each_group
 from sbi_rope.density import Density, Mixture, MixturePosterior
 from sbi_rope.density.base import without_nan
 from sbi_rope.density.sets import SetScores, joint_scores, marginal_scores
@@ -138,13 +138,12 @@ def _score_fold(
 ) -> FoldScores:
     """Score the stack that has not seen a fold at the pairs of the fold."""
     rows = data.folds[number]
-    x, labels = data.pairs.x[rows], data.pairs.label[rows]
+    pairs = data.pairs[rows]
     posterior = fold_posterior(Mixture(densities, weights), data.prior)
     with _explained():
         if data.pairs.are_exact:
-            return _score_exact(posterior, data.pairs.mean[rows], x, seed=seed)
-        scores = of_labels.of_stack(weights)
-        return _score_labels(posterior, scores, labels, x, seed=seed)
+            return _score_exact(posterior, pairs.mean, pairs.x, seed=seed)
+        return _score_labels(posterior, of_labels.of_stack(weights), pairs, seed=seed)
 
 
 def _set_scores(
@@ -155,7 +154,7 @@ def _set_scores(
     Labels that are not exact do not count: a set that holds a noisy label need not hold
     the parameters.
     """
-    is_counted = data.pairs.label.is_exact.cpu()
+    is_counted = data.pairs.is_exact.cpu()
     if not is_counted.any():
         return None
     groups = groups_of(data.pairs.group.cpu()[is_counted])
@@ -172,13 +171,12 @@ def _set_scores(
 
 def _log_unit(data: StackData) -> float | Tensor:
     """Return by how much scores are higher in the prior's standard deviations."""
-    labels = data.pairs.label
-    if labels.are_drawn:
+    if data.pairs.are_drawn:
         return 0.0  # these scores are relative to the prior
     units = data.prior.log_units()
-    if labels.are_exact:
+    if data.pairs.are_exact:
         return float(units.sum())
-    return labels.is_measured.to(units) @ units
+    return data.pairs.is_measured.to(units) @ units
 
 
 @torch.no_grad()
@@ -237,8 +235,8 @@ def _at_labels(
         size = torch.Size((NUM_REFERENCES,))
         with seeded(data.seed_of(rows)):
             nodes = nodes_of(
-                data.pairs.label[rows],
-                [reference_of(one.sample(size, x)) for one in densities],
+                data.pairs[rows],
+                [one.sample(size, x) for one in densities],
                 data.prior,
                 num_nodes=NUM_NODES,
             )
@@ -251,8 +249,7 @@ def _at_labels(
 def _score_labels(
     posterior: MixturePosterior,
     scores: tuple[Tensor, Tensor],
-    labels: Labels,
-    x: Tensor,
+    pairs: Pairs,
     *,
     seed: int,
 ) -> FoldScores:
@@ -265,22 +262,21 @@ def _score_labels(
     hold the parameters.
     """
     log_prob, errors = scores
+    y, x = pairs.y, pairs.x
     log_mass = posterior.leakage_correction(x).double().log()
-    std = labels.covariance.diagonal(dim1=1, dim2=2).sqrt()
     with seeded(seed):
         samples = draw_samples(posterior, x, num_samples=NUM_SAMPLES)
-        measured = samples + std.to(samples) * torch.randn_like(samples)
-    known = labels.is_measured & (not labels.are_drawn)
-    estimates, ranks = estimates_and_ranks(measured, labels.y)
-    marginal = torch.full_like(labels.y, torch.nan)
+        noise = pairs.std.nan_to_num().to(samples) * torch.randn_like(samples)
+    estimates, ranks = estimates_and_ranks(samples + noise, y)
+    marginal = torch.full_like(y, torch.nan)
     joint = torch.full_like(log_prob, torch.nan)
-    if (exact := labels.is_exact).any():
-        at_exact = _score_exact(posterior, labels.y[exact], x[exact], seed=seed)
+    if (exact := pairs.is_exact).any():
+        at_exact = _score_exact(posterior, y[exact], x[exact], seed=seed)
         joint[exact], marginal[exact] = at_exact.joint, at_exact.marginal.to(marginal)
     return FoldScores(
         log_prob=log_prob - log_mass,
-        estimates=estimates.to(labels.y),
-        ranks=ranks.to(labels.y).where(known, torch.nan),
+        estimates=estimates.to(y),
+        ranks=ranks.to(y).where(pairs.is_measured, torch.nan),
         joint=joint,
         marginal=marginal,
         errors=errors,

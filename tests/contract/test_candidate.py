@@ -54,13 +54,12 @@ def poisoned(data: StackData, rows: Tensor) -> StackData:
     """Return the data with NaN in everything that is known of some pairs."""
     changed, pairs = copy.copy(data), data.pairs
     # NaN would be a parameter that was not measured.
-    y = pairs.label.y.index_fill(0, rows, torch.inf)
+    y = pairs.y.index_fill(0, rows, torch.inf)
     theta, x, weight = (
         one.index_fill(0, rows, torch.nan)
         for one in (pairs.theta, pairs.x, pairs.weight)
     )
-    label = replace(pairs.label, y=y)
-    changed.pairs = replace(pairs, theta=theta, x=x, weight=weight, label=label)
+    changed.pairs = replace(pairs, theta=theta, x=x, weight=weight, y=y)
     changed.kept = {}
     return changed
 

@@ -72,10 +72,9 @@ def test_a_table_is_put_in_the_order_of_the_first_one() -> None:
     noise = first.assign(a=0.1, b=0.2)[["b", "a"]]
     rope.append_calibration(first, x_first, theta_std=noise)
     rope.append_calibration(second, x_second, theta_std=noise.iloc[0])
-    assert torch.equal(rope.pairs.label.y, torch.cat([theta, theta]))
+    assert torch.equal(rope.pairs.y, torch.cat([theta, theta]))
     assert torch.equal(rope.calibration[1], torch.cat([x, x]))
-    variance = rope.pairs.label.covariance.diagonal(dim1=1, dim2=2)
-    assert torch.allclose(variance.sqrt().float(), torch.tensor([0.1, 0.2]))
+    assert torch.allclose(rope.pairs.std.float(), torch.tensor([0.1, 0.2]))
     method = DiscrepancyNPE.from_posterior(
         gaussian.posterior(), simulator=gaussian.simulator, space="tuned", num_steps=2
     )

@@ -8,13 +8,8 @@ from sbi_rope import RoPE, diagnose
 from sbi_rope.methods import DiscrepancyNPE, FinetunedNPE
 from sbi_rope.methods.training import Training
 from sbi_rope.metrics import draw_samples, evaluate
-from sbi_rope.stacking import (
-    default_candidates,
-)
-from sbi_rope.utils.errors import (
-    InvalidInputError,
-    UnsupportedPosteriorError,
-)
+from sbi_rope.stacking import default_candidates
+from sbi_rope.utils.errors import InvalidInputError, UnsupportedPosteriorError
 from tests import problems
 from tests.stacks import QUICK, QUIET, stacked
 
@@ -26,11 +21,8 @@ def labelled(n: int) -> tuple[Tensor, Tensor]:
 
 
 def rope() -> RoPE:
-    rope = RoPE(
-        problems.trials_posterior(),
-        simulator=problems.simulate_trials,
-        finetuner=QUICK,
-    )
+    npe, simulator = problems.trials_posterior(), problems.simulate_trials
+    rope = RoPE(npe, simulator=simulator, finetuner=QUICK)
     return rope.append_calibration(*labelled(12))
 
 
@@ -92,11 +84,8 @@ def test_what_the_net_cannot_read_is_refused() -> None:
         match = rf"cannot read; got .*\(first: \[{row[0]}\]\)"
         with pytest.raises(InvalidInputError, match=match):
             rope().append_calibration(theta, x)
-    theta, x = labelled(10)
-    x[4, 0, 0] = torch.inf
-    posterior = problems.trials_posterior()
-    with pytest.raises(InvalidInputError, match="`x`"):
-        evaluate(posterior, theta, x)
+        with pytest.raises(InvalidInputError, match="`x`"):
+            evaluate(problems.trials_posterior(), theta, x)
 
 
 def test_a_net_that_counts_the_trials_of_another_row_is_refused() -> None:

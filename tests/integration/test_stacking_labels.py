@@ -61,16 +61,14 @@ def test_a_stack_is_scored_on_what_was_measured(tmp_path: Any) -> None:
     with pytest.raises(InvalidInputError, match="some exact labels"):
         posterior.credible_set(0.8, x=observed()[:1], guaranteed=True)
     save(posterior, tmp_path / "stack")
-    loaded = load(tmp_path / "stack")
-    assert loaded.report.labels == scores.labels
-    write_html(loaded.report, tmp_path / "report.html")
+    write_html(load(tmp_path / "stack").report, tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert known in page
     assert ">nan<" not in page
 
 
 @pytest.mark.medium
-def test_exact_labels_among_others_give_sets_with_a_guarantee(tmp_path: Path) -> None:
+def test_exact_labels_among_others_give_sets_with_a_guarantee() -> None:
     """One of each specimen counts, and none whose label is noisy or partial."""
     std = torch.zeros(NUM_PAIRS, 2)
     std[1] = 0.1
@@ -83,13 +81,8 @@ def test_exact_labels_among_others_give_sets_with_a_guarantee(tmp_path: Path) ->
     assert int(is_exact.sum()) == 9
     assert len(scores) == 8
     assert torch.isfinite(scores.joint).all()
-    x = observed()[:1]
-    save(posterior, tmp_path / "stack")
-    again = load(tmp_path / "stack").credible_intervals(0.8, x, guaranteed=True, seed=0)
-    expected = posterior.credible_intervals(0.8, x, guaranteed=True, seed=0)
-    assert torch.equal(again.low, expected.low)
     with pytest.raises(InvalidInputError, match="8 exact labels"):
-        posterior.credible_set(0.9, x, guaranteed=True)
+        posterior.credible_set(0.9, observed()[:1], guaranteed=True)
 
 
 def test_a_single_label_may_be_partial() -> None:
@@ -109,7 +102,7 @@ def test_labels_of_vanishing_noise_are_scored_like_exact_ones() -> None:
 
 
 @pytest.mark.medium
-def test_labels_given_as_draws_are_scored_relative_to_the_prior(tmp_path: Path) -> None:
+def test_labels_given_as_draws_are_scored_relative_to_the_prior() -> None:
     draws = (THETA[:, None] + 0.05 * torch.randn(NUM_PAIRS, 30, 2)).clamp(-0.99, 0.99)
     posterior = stacked(labelled(draws), candidates=[PRIOR, NPE])
     scores = posterior.report
@@ -118,10 +111,6 @@ def test_labels_given_as_draws_are_scored_relative_to_the_prior(tmp_path: Path) 
     text = " ".join(str(posterior.report).split())
     assert "Coverage is not known" in text
     assert "relative to that of the prior" in text
-    write_html(posterior.report, tmp_path / "draws.html")
-    page = (tmp_path / "draws.html").read_text()
-    assert ">nan" not in page
-    assert "Coverage is not known" in page
     # Where draws are on a bound of the prior, too.
     draws[0, :5, 0] = 1.0
     scores = validated(labelled(draws), candidates=[PRIOR, NPE])
@@ -142,24 +131,10 @@ def test_a_parameter_that_was_never_measured_is_named(tmp_path: Path) -> None:
 def test_labels_without_noise_take_the_path_of_exact_ones() -> None:
     exact, found = (
         validated(labelled(THETA, **some), candidates=[PRIOR, CANDIDATES[3]])
-        for some in ({}, {"theta_cov": torch.zeros(2, 2), "weights": [1.0] * 20})
+        for some in ({}, {"theta_std": 0.0, "weights": [1.0] * 20})
     )
     assert torch.equal(exact.log_scores, found.log_scores)
     assert torch.equal(exact.held_out.log_prob, found.held_out.log_prob)
-
-
-@pytest.mark.medium
-def test_rehearsal_learns_from_labels_that_are_not_exact() -> None:
-    rehearsed = [c for c in CANDIDATES if c.name == "fine-tuned NPE, rehearsed"]
-    weights = torch.linspace(0.5, 2.0, NUM_PAIRS)
-    exact, noisy, weighted = (
-        validated(labelled(THETA, **some), candidates=rehearsed).log_scores
-        for some in ({}, {"theta_std": 0.3}, {"weights": weights})
-    )
-    assert noisy.isfinite().all()
-    assert weighted.isfinite().all()
-    assert not torch.equal(noisy, exact)
-    assert not torch.equal(weighted, exact)
 
 
 def test_the_weights_of_pairs_decide_for_the_candidate_that_they_favour() -> None:

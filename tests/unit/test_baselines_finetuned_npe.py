@@ -11,7 +11,7 @@ from sbi.neural_nets import posterior_nn
 from torch import Tensor, nn
 
 from sbi_rope.baselines import FinetunedNPE, PlainNPE, Training
-from sbi_rope.data.pairs import epochs_on_pairs, split_groups, split_pairs
+from sbi_rope.data.pairs import Pairs, epochs_on_pairs, split_pairs
 from sbi_rope.density import MixturePosterior
 from sbi_rope.methods import DiscrepancyNPE
 from sbi_rope.tasks import get_task
@@ -121,7 +121,7 @@ def test_every_pair_is_held_out_by_one_network() -> None:
     for count in [2, 5, 20]:
         method = finetuned(npe(), num_holdouts=count)
         with seeded(0):
-            folds = split_groups(PAIRS[0], count)
+            folds = Pairs.exact(*PAIRS).folds(count)
         held_out, at_start = networks(method, PAIRS), log_probs(npe(), *PAIRS)
         assert len(method.histories) == len(folds) == held_out.shape[1] == count
         for k, (rows, history) in enumerate(zip(folds, method.histories, strict=True)):

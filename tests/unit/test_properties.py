@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from sbi_rope import SinkhornCoupler
-from sbi_rope.data.pairs import split_groups, split_pairs
+from sbi_rope.data.pairs import Pairs, split_pairs
 from sbi_rope.discrepancy import DiscrepancyModel, learn_parameters
 from sbi_rope.metrics.evaluation import estimates_and_ranks
 from sbi_rope.stacking import stacking_weights
@@ -85,7 +85,7 @@ def test_no_group_of_pairs_is_on_both_sides_of_a_split(
     groups: list[int], fraction: float, num_folds: int
 ) -> None:
     numbers = torch.tensor(groups)
-    folds = split_groups(numbers, num_folds)
+    folds = Pairs.exact(numbers[:, None].float(), numbers).folds(num_folds)
     assert len(folds) == min(num_folds, len(set(groups)))
     for parts in (split_pairs(numbers, fraction), folds):
         assert sorted(torch.cat(list(parts)).tolist()) == list(range(len(groups)))
