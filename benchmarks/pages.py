@@ -23,21 +23,18 @@ from benchmarks.methods import GIVEN_PRIOR_STACK, METHODS, STACK
 from benchmarks.published import (
     LETTERS,
     MAX_PAIRS,
+    NEAR,
     PAPER,
     SIZE,
     Comparison,
     Published,
-    against_candidates,
     compare,
     finished,
     half_width,
     mean,
     num_repetitions,
 )
-from benchmarks.store import Results
 from sbi_rope.utils.files import write_atomically
-
-__all__ = ["BLOCK", "BLOCKS", "pages_with_blocks", "write_pages"]
 
 END = "<!-- /results -->"
 BLOCK = re.compile(rf"(<!-- results: ([\w-]+) -->\n)(.*?){END}", re.DOTALL)
@@ -153,7 +150,7 @@ def _overview(published: Published) -> Lines:
         missing = {*suite.cells} - {*rows.index}
         lines.append(
             [
-                f"[{name}]({name}/report.md)" if len(rows) else name,
+                f"[{name}]({name}/{suite.x_axis}.png)" if len(rows) else name,
                 (rows["status"] == "finished").sum(),
                 _counts(rows["method"][rows["status"] == "failed"]),
                 _counts(f"{cell.task} {cell.variant}".strip() for cell in missing),
@@ -185,8 +182,7 @@ def _all_tasks(published: Published, text: Callable[[pd.DataFrame], str]) -> Lin
 def _column(
     published: Published, task: str, text: Callable[[pd.DataFrame], str]
 ) -> dict[str, str]:
-    present = [name for name in METHODS if not METHODS[name].past]
-    parts = {name: published.select(name, task=task) for name in present}
+    parts = {name: published.select(name, task=task) for name in METHODS}
     count = num_repetitions(parts.values())
     best = _best(parts, count) if text is lpp_text else None
     # It does not compete, or one of two would be chosen by the reported score.
@@ -283,16 +279,19 @@ def _counted(goal: str, met: Mapping[str, bool]) -> str:
 
 def _against_candidates(published: Published) -> Lines:
     """Count how near the stacks of `stacking` are to the best of their candidates."""
-    found = against_candidates(Results(published.folder / "stacking"))
+    rows = finished(published.rows["stacking"])
+    rows = rows[rows["method"] == STACK]
     lines = [
         [
             size,
             len(part),
-            (part["best"] >= -0.1).sum(),
-            (part["basics"] >= -0.1).sum(),
-            (part["held_out"].abs() <= 2).sum(),
+            (part["lpp_z"] - part["best_candidate"] >= -NEAR).sum(),
+            (part["lpp_z"] - part["best_basic"] >= -NEAR).sum(),
+            (
+                (part["lpp_z"] - part["held_out"]).abs() <= 2 * part["held_out_error"]
+            ).sum(),
         ]
-        for size, part in found.groupby("size")
+        for size, part in rows.groupby("n_calibration")
     ]
     head = ("pairs", "stacks", "within 0.1 of the best candidate")
     head += ("not 0.1 below prior or NPE", "within two errors of the held-out score")
