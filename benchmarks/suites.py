@@ -40,19 +40,22 @@ class Suite:
         Cells that need no pairs are of any ``n_calibration``.
 
         Raises:
-            SystemExit: If the suite has none of a name.
+            SystemExit: If the suite does not know a value, or nothing is left.
         """
         cells = [*self.cells]
         for name, values in wanted.items():
-            known = {getattr(cell, name) for cell in cells}
-            if unknown := {*(values or ())} - known:
+            if not values:
+                continue
+            known = {getattr(cell, name) for cell in self.cells}
+            if unknown := {*values} - known:
                 raise SystemExit(
                     f"{self.name}: expected {name} among {sorted(known)}; "
                     f"got {sorted(unknown)}."
                 )
-            if values:
-                among = {*values, 0} if name == "n_calibration" else values
-                cells = [cell for cell in cells if getattr(cell, name) in among]
+            among = {*values, 0} if name == "n_calibration" else values
+            cells = [cell for cell in cells if getattr(cell, name) in among]
+        if not cells:
+            raise SystemExit(f"{self.name}: no cell is in all of these; got {wanted}.")
         return cells
 
 

@@ -89,11 +89,13 @@ def test_unknown_names_are_refused_with_the_known_ones(tmp_path: Path) -> None:
             load_suite(str(path))
 
 
-def test_ci_expects_as_many_finished_cells_as_the_smoke_suite_has() -> None:
+def test_the_smoke_suite_has_every_method_and_as_many_cells_as_ci_expects() -> None:
     cells = load_suite("smoke").cells
     assert f"\nexpected={len(cells)} " in (ROOT / ".ci" / "run").read_text()
     slow = {"RNPE", "HVAE"}
     assert {cell.method for cell in cells} == {*METHODS} - slow - {"stack, given prior"}
+    # No two are drawn alike.
+    assert len({entry.style for entry in METHODS.values()}) == len(METHODS)
 
 
 # Results ----------------------------------------------------------------------------
@@ -161,11 +163,6 @@ def test_committed_rows_stay_as_they_are_when_a_run_goes_on_from_them(
 # Figures ----------------------------------------------------------------------------
 
 
-def test_no_two_methods_are_drawn_alike() -> None:
-    styles = [entry.style for entry in METHODS.values()]
-    assert len(set(styles)) == len(styles)
-
-
 @pytest.mark.medium
 def test_a_suite_is_drawn_with_failures_and_what_is_not_finite(
     suite: Suite, tmp_path: Path
@@ -204,16 +201,3 @@ def test_every_preset_builds_an_estimator_for_every_task(name: str) -> None:
             continue
         estimator = settings_of(task).builder(task)(theta, x)
         assert estimator.log_prob(theta[None], condition=x).shape == (1, 8)
-
-
-def test_the_papers_flow_has_the_papers_layers() -> None:
-    task = get_task("pendulum")
-    theta, x = task.get_prior().sample((8,)), torch.randn(8, *task.x_shape)
-    estimator = PRESETS["paper"](task).builder(task)(theta, x)
-    widths = [
-        tuple(weight.shape[-2:])
-        for name, weight in estimator.net.named_parameters()
-        if name.endswith("weight")
-    ]
-    # Conditioner and integrand: three hidden layers of 100 each.
-    assert sum(shape == (100, 100) for shape in widths) == 4
