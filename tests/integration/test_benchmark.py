@@ -119,7 +119,7 @@ def test_only_what_another_version_has_made_is_computed_again(
         main([*command, "prior", "NPE", "--again"])
         assert count in capsys.readouterr().out
     assert {*Results(path.parent).rows["git_commit"]} == {"bbbbbbb"}
-    # Nobody knows whether two changed versions are the same.
+    # Of changed code, too.
     monkeypatch.setattr(runner, "code_version", lambda: "bbbbbbb+")
     for _ in range(2):
         main([*command, "prior", "--again"])
