@@ -3,31 +3,28 @@
     python -m benchmarks run smoke
     python -m benchmarks run main --task pendulum --jobs 2 --root FOLDER
     python -m benchmarks status
-    python -m benchmarks figures
     python -m benchmarks summary
 
 `run` keeps each result in `OUT/SUITE` as soon as it is there, and computes only what is
-missing; `--retry` also what failed. It ends with status 1 if a cell failed. `status`
-counts cells, `figures` draws the pictures of suites, and `summary` writes the tables of
-README, of `benchmarks/results/README.md` and of pages of docs. With
-`--out benchmarks/results` it goes on from the committed results.
+missing; `--retry` also what failed, and `--again` also what another version of the code
+has made. It ends with status 1 if a cell failed. `status` counts cells. `summary`
+writes the tables of README, of `benchmarks/results/README.md` and of pages of docs, and
+draws their pictures. With `--out benchmarks/results` it goes on from the
+committed results.
 """
 
 import argparse
-import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.cases import Sources
-from benchmarks.cells import list_suites, load_suite
-from benchmarks.figures import draw_all, draw_overview
+from benchmarks.cases import Workplace
+from benchmarks.figures import draw_overview, draw_suite
 from benchmarks.pages import pages_with_blocks, write_pages
 from benchmarks.published import Published
-from benchmarks.runner import Workplace, run_cells
+from benchmarks.runner import run_cells
 from benchmarks.store import Results
+from benchmarks.suites import list_suites, load_suite
 
-DEFAULT_OUT = Path("results/benchmark")
-PUBLISHED = Path(__file__).parent / "results"
 ROOT = Path(__file__).parents[1]
 
 
@@ -40,41 +37,34 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     run = commands.add_parser("run", help="run the cells of a suite")
-    run.set_defaults(command=_run, out=DEFAULT_OUT)
+    run.set_defaults(command=_run)
     run.add_argument("suite", help=f"one of {', '.join(list_suites())}, or a TOML file")
-    for name, kind in (("task", str), ("method", str), ("repetition", int)):
-        run.add_argument(
-            f"--{name}",
-            nargs="+",
-            action="extend",
-            type=kind,
-            dest=f"{name}s",
-            help="these only",
-        )
+    for name, kind in {
+        "task": str,
+        "method": str,
+        "n-calibration": int,
+        "repetition": int,
+    }.items():
+        run.add_argument(f"--{name}", nargs="+", type=kind, help="these only")
     run.add_argument("--jobs", type=int, default=1, help="at a time; -1: all cores")
-    run.add_argument(
-        "--backend",
-        default="loky",
-        choices=["loky", "sequential", "dask"],
-        help="backend of joblib (%(default)s)",
-    )
-    run.add_argument("--scheduler", help="address of a dask scheduler")
     run.add_argument("--device", default="cpu", help="%(default)s, or cuda")
     run.add_argument("--root", type=Path, help="folder of recorded data")
     run.add_argument(
         "--hemodynamics", type=Path, help="folder with simulator.npz and real.npz"
     )
-    run.add_argument("--again", action="store_true", help="also what is finished")
+    run.add_argument(
+        "--again", action="store_true", help="also what other versions have made"
+    )
     run.add_argument("--retry", action="store_true", help="also what failed")
     status = commands.add_parser("status", help="count cells")
-    status.set_defaults(command=_status, out=DEFAULT_OUT)
-    figures = commands.add_parser("figures", help="draw the pictures of suites")
-    figures.set_defaults(command=_figures, out=PUBLISHED)
-    figures.add_argument("suites", nargs="*", help="all if none")
-    summary = commands.add_parser("summary", help="write the tables of all pages")
-    summary.set_defaults(command=_summary, out=PUBLISHED)
-    for command in (run, status, figures, summary):
-        out = command.get_default("out")
+    status.set_defaults(command=_status)
+    summary = commands.add_parser("summary", help="write all tables and pictures")
+    summary.set_defaults(command=_summary)
+    for command, out in (
+        (run, "results/benchmark"),
+        (status, "results/benchmark"),
+        (summary, ROOT / "benchmarks/results"),
+    ):
         command.add_argument("--out", type=Path, default=out, help="(%(default)s)")
     args = parser.parse_args(arguments)
     return args.command(args)
@@ -83,26 +73,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(args: argparse.Namespace) -> int:
     suite = load_suite(args.suite)
     cells = suite.select(
-        tasks=args.tasks, methods=args.methods, repetitions=args.repetitions
+        task=args.task,
+        method=args.method,
+        n_calibration=args.n_calibration,
+        repetition=args.repetition,
     )
     results = Results(args.out / suite.name)
-    place = Workplace(
-        folder=args.out,
-        sources=Sources(root=args.root, hemodynamics=args.hemodynamics),
-        device=args.device,
+    place = Workplace(args.out, args.root, args.hemodynamics, args.device)
+    counts = run_cells(
+        cells, results, place, jobs=args.jobs, again=args.again, retry=args.retry
     )
-    with _scheduler(args):
-        counts = run_cells(
-            cells,
-            results,
-            place,
-            jobs=args.jobs,
-            backend=args.backend,
-            again=args.again,
-            retry=args.retry,
-        )
-    results.tidy(suite.cells)
-    draw_all(suite, results)
+    results.sort(suite.cells)
+    draw_suite(suite, results.rows, results.folder)
     rows = results.rows.loc[cells]
     table = rows.pivot_table("lpp_z", "method", ["task", "n_calibration"], sort=False)
     print(table.round(2).to_string(na_rep="-"))
@@ -112,23 +94,6 @@ def _run(args: argparse.Namespace) -> int:
     print(", ".join(f"{count} {what}" for what, count in counts.items()))
     print(f"Written: {results.path}")
     return 1 if len(failed) else 0
-
-
-@contextlib.contextmanager
-def _scheduler(args: argparse.Namespace) -> Iterator[None]:
-    """Connect to a dask cluster, or start one on this machine, if dask is asked for."""
-    if args.backend != "dask":
-        yield
-        return
-    from distributed import Client
-
-    options = (
-        {"address": args.scheduler}
-        if args.scheduler
-        else {"n_workers": max(args.jobs, 1), "threads_per_worker": 1}
-    )
-    with Client(**options):
-        yield
 
 
 def _status(args: argparse.Namespace) -> int:
@@ -142,16 +107,12 @@ def _status(args: argparse.Namespace) -> int:
     return 0
 
 
-def _figures(args: argparse.Namespace) -> int:
-    for name in args.suites or list_suites():
-        print(*draw_all(load_suite(name), Results(args.out / name)), sep="\n")
-    return 0
-
-
 def _summary(args: argparse.Namespace) -> int:
     published, pages = Published.read(args.out), pages_with_blocks(ROOT)
     write_pages(published, pages)
-    draw_overview(published, args.out)
+    draw_overview(published)
+    for name, suite in published.suites.items():
+        draw_suite(suite, published.rows[name], args.out / name)
     print(f"Written: {', '.join(map(str, pages))}")
     return 0
 

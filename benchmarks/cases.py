@@ -1,27 +1,25 @@
-"""The data and the trained NPE that all methods of a table share."""
+"""The data of a cell, and the trained NPE that all methods of a table share."""
 
-import copy
 import hashlib
 import json
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import torch
-from sbi.inference.posteriors import DirectPosterior
 from torch import Tensor
 
 from benchmarks.cells import Cell
 from benchmarks.presets import PRESETS, Settings
 from sbi_rope.baselines import PlainNPE
+from sbi_rope.saving import load, save
 from sbi_rope.tasks import Task, get_task
 from sbi_rope.utils.files import write_atomically
-
-__all__ = ["Case", "Sources", "posterior_with", "state_of"]
 
 Pairs = tuple[Tensor, Tensor]
 
@@ -31,18 +29,22 @@ HELD_OUT = 0.1
 MAX_CACHED = 100e6
 
 
-@dataclass(frozen=True, kw_only=True)
-class Sources:
-    """Where recorded and stored data are; an output folder belongs to one of these.
+@dataclass(frozen=True)
+class Workplace:
+    """Where a run reads and writes, and what it runs on.
 
     Attributes:
-        root: Folder of the chambers' recordings.
+        folder: A folder for each suite, and `cache` for what cells share.
+        root: Folder of the recorded data.
         hemodynamics: Folder with simulator.npz and real.npz; the small sets inside the
             package if None.
+        device: Where networks are trained.
     """
 
+    folder: Path
     root: Path | None = None
     hemodynamics: Path | None = None
+    device: str = "cpu"
 
     def task(self, cell: Cell) -> Task:
         """Return the task of a cell."""
@@ -57,26 +59,6 @@ class Sources:
         )
 
 
-def cached(folder: Path, kind: str, content: Any, compute: Callable[[], Any]) -> Any:
-    """Return what cells share: tensors and numbers, and collections of these.
-
-    This is not joblib's ``Memory``, because reading a pickle can run code.
-
-    Args:
-        folder: Where it is kept.
-        kind: First part of the file's name.
-        content: What it depends on, as JSON.
-        compute: Returns it.
-    """
-    text = json.dumps(content, sort_keys=True)
-    path = folder / f"{kind}-{hashlib.sha256(text.encode()).hexdigest()[:20]}.pt"
-    if not path.exists():
-        value = compute()
-        with write_atomically(path) as temporary:
-            torch.save(value, temporary)
-    return torch.load(path, weights_only=True)
-
-
 class CountingSimulator:
     """A simulator that knows how many simulations it made."""
 
@@ -89,7 +71,7 @@ class CountingSimulator:
         return self.simulator(theta)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Case:
     """The data of a cell, drawn when they are asked for, and the NPE trained on them.
 
@@ -97,23 +79,23 @@ class Case:
     repetition: all methods see the same.
     """
 
-    task: Task
-    settings: Settings
     cell: Cell
-    cache: Path
-    device: str
+    place: Workplace
 
-    @classmethod
-    def of(cls, cell: Cell, sources: Sources, cache: Path, device: str) -> "Case":
-        """Return the case of a cell."""
-        task = sources.task(cell)
-        return cls(
-            task=task,
-            settings=PRESETS[cell.preset](task),
-            cell=cell,
-            cache=cache,
-            device=device,
-        )
+    @cached_property
+    def task(self) -> Task:
+        """The task."""
+        return self.place.task(self.cell)
+
+    @cached_property
+    def settings(self) -> Settings:
+        """What methods are run with."""
+        return PRESETS[self.cell.preset](self.task)
+
+    @property
+    def device(self) -> str:
+        """Where networks are trained."""
+        return self.place.device
 
     @property
     def seed(self) -> int:
@@ -127,40 +109,53 @@ class Case:
             return None
         return CountingSimulator(self.task.get_simulator())
 
-    @cached_property
+    @property
+    def num_simulated(self) -> int:
+        """Simulations that methods made so far."""
+        return 0 if self.simulator is None else self.simulator.count
+
+    @property
     def simulations(self) -> Pairs:
         """Pairs to train on."""
         return self._simulated["train"]
 
-    @cached_property
+    @property
     def stored(self) -> Pairs:
         """Pairs that RoPE uses where there is no simulator."""
         return self._simulated["stored"]
 
     @cached_property
     def _simulated(self) -> dict[str, Pairs]:
-        def draw() -> dict[str, Pairs]:
-            if self.task.name == "hemodynamics":
-                return self._split_people()
-            pairs = self.task.get_simulations(
-                self.settings.num_simulations, seed=self.seed
-            )
-            return {"train": pairs}
-
         size = 4 * self.settings.num_simulations * math.prod(self.task.x_shape)
-        if size > MAX_CACHED:
-            pairs = draw()
+        path = self._cached(
+            "simulations",
+            task=[self.cell.task, self.cell.variant, self.cell.options],
+            number=self.settings.num_simulations,
+            seed=self.seed,
+        )
+        if path.exists():
+            pairs = torch.load(path, weights_only=True)
         else:
-            content = {
-                "task": [self.cell.task, self.cell.variant, self.cell.options],
-                "number": self.settings.num_simulations,
-                "seed": self.seed,
-            }
-            pairs = cached(self.cache, "simulations", content, draw)
+            pairs = self._drawn()
+            if size <= MAX_CACHED:
+                with write_atomically(path) as temporary:
+                    torch.save(pairs, temporary)
         return {
             name: (theta.to(self.device), x.to(self.device))
             for name, (theta, x) in pairs.items()
         }
+
+    def _cached(self, kind: str, **content: Any) -> Path:
+        """Return the file of what cells share, named by what it depends on."""
+        text = json.dumps(content, sort_keys=True)
+        key = hashlib.sha256(text.encode()).hexdigest()[:20]
+        return self.place.folder / "cache" / f"{kind}-{key}.pt"
+
+    def _drawn(self) -> dict[str, Pairs]:
+        if self.task.name == "hemodynamics":
+            return self._split_people()
+        number = self.settings.num_simulations
+        return {"train": self.task.get_simulations(number, seed=self.seed)}
 
     def _split_people(self) -> dict[str, Pairs]:
         """Split stored people: recordings to train on, one more of each, held out."""
@@ -194,9 +189,9 @@ class Case:
         return theta.to(self.device), x.to(self.device)
 
     @property
-    def held_out(self) -> Pairs | None:
+    def held_out(self) -> Pairs:
         """Simulated people for the line "SBI" where there is no simulator."""
-        return self._simulated.get("held_out")
+        return self._simulated["held_out"]
 
     @cached_property
     def builder(self) -> Any:
@@ -208,16 +203,29 @@ class Case:
     @property
     def npe(self) -> Any:
         """The trained posterior of NPE."""
-        return self._npe["posterior"]
+        return self._npe[0]
 
     @property
     def npe_seconds(self) -> float:
         """How long the training of NPE took, whenever that was."""
-        return self._npe["seconds"]
+        return self._npe[1]
 
     @cached_property
-    def _npe(self) -> dict[str, Any]:
-        def train() -> dict[str, Any]:
+    def _npe(self) -> tuple[Any, float]:
+        # By their content: variants that change real data only share an NPE.
+        path = self._cached(
+            "npe",
+            simulations=[digest(part) for part in self.simulations],
+            seed=self.seed,
+            training=asdict(self.settings.training),
+            flow=[self.settings.flow, self.settings.flow_options],
+            light_net=self.settings.light_net,
+            device=self.device,
+            # A file is read by the versions that wrote it only.
+            versions=[version("sbi"), version("sbi-rope")],
+        )
+        seconds = path.with_suffix(".seconds")
+        if not path.exists():
             start = time.perf_counter()
             npe = PlainNPE(
                 self.task.get_prior(),
@@ -227,71 +235,16 @@ class Case:
             )
             npe.append_simulations(*self.simulations)
             npe.train(seed=self.seed, show_progress_bars=False)
-            seconds = time.perf_counter() - start
-            return {"state": state_of(npe.build_posterior()), "seconds": seconds}
-
-        # By their content: variants that change real data only share an NPE.
-        content = {
-            "simulations": [digest(part) for part in self.simulations],
-            "seed": self.seed,
-            "training": asdict(self.settings.training),
-            "flow": [self.settings.flow, self.settings.flow_options],
-            "light_net": self.settings.light_net,
-            "device": self.device,
-        }
-        kept = cached(self.cache, "npe", content, train)
-        posterior = posterior_with(
-            kept["state"],
-            prior=self.task.get_prior(),
-            build=self.builder,
-            simulations=self.simulations,
-            device=self.device,
-        )
-        return {"posterior": posterior, "seconds": kept["seconds"]}
+            path.parent.mkdir(parents=True, exist_ok=True)
+            seconds.write_text(str(time.perf_counter() - start))
+            save(npe.build_posterior(), path, overwrite=True)
+        posterior = load(path)
+        if self.device != "cpu":
+            posterior.to(self.device)
+        return posterior, float(seconds.read_text())
 
 
 def digest(tensor: Tensor) -> str:
     """Return a checksum of a tensor's values."""
     values = tensor.detach().cpu().contiguous().numpy()
     return hashlib.sha256(values.tobytes()).hexdigest()
-
-
-# Trained estimators as tensors, so that reading them runs no code --------------------
-
-
-def state_of(posterior: Any) -> dict[str, Tensor]:
-    """Return the weights and buffers of the estimator in a posterior of NPE."""
-    state = posterior.posterior_estimator.state_dict()
-    return {name: values.detach().cpu().clone() for name, values in state.items()}
-
-
-def posterior_with(
-    state: Mapping[str, Tensor],
-    *,
-    prior: Any,
-    build: Callable[[Tensor, Tensor], Any],
-    simulations: tuple[Tensor, Tensor],
-    device: str = "cpu",
-) -> DirectPosterior:
-    """Build a posterior of NPE anew, and give it the weights of a trained one.
-
-    Args:
-        state: What :func:`state_of` returned.
-        prior: The prior.
-        build: What sbi's ``posterior_nn(...)`` returns.
-        simulations: Pairs of the shapes that it was trained on.
-        device: Where to put it.
-
-    Raises:
-        RuntimeError: If the weights are those of another estimator.
-    """
-    # Its first weights are random, and none of them is kept.
-    with torch.random.fork_rng():
-        # `build` may put its own embedding net into each estimator that it builds.
-        estimator = copy.deepcopy(build(*simulations))
-    estimator.load_state_dict(state)
-    estimator = estimator.to(device).eval()
-    prior = copy.deepcopy(prior)
-    if hasattr(prior, "to"):
-        prior.to(device)
-    return DirectPosterior(estimator, prior, device=device)

@@ -2,26 +2,23 @@
 
 import json
 import math
-import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import torch
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from benchmarks.cells import Cell, Suite, data_in_words
+from benchmarks.cells import Cell, data_in_words
 from benchmarks.methods import METHODS, STACK
-from benchmarks.published import LETTERS, Published, finished, relative_ranks
-from benchmarks.store import WHERE, Results
-from sbi_rope import plots
-from sbi_rope.plots._figures import empty_figure, hide_frame, new_figure, panel_grid
+from benchmarks.published import LETTERS, Published, finished, known, relative_ranks
+from benchmarks.suites import Suite
+from sbi_rope.plots._figures import empty_figure, hide_frame, new_figure
 from sbi_rope.utils.files import write_atomically
 
-__all__ = ["LPPAxis", "curves", "draw_all", "draw_overview", "rank_figure"]
-
+# Cells with the same of these have the same data, but for the repetition.
+WHERE = ["task", "variant", "options"]
 # With the distances as they are, as in the paper.
 UNSCALED = {"RoPE": "#003050", "OT-only": "#2A6F97"}
 # Lines that differ in calibration pairs only.
@@ -32,10 +29,6 @@ MAX_TICKS = 5
 MAX_COLUMNS = 9
 # Lines of a legend in an inch of height.
 LEGEND_LINES = 4.5
-# Calibration pairs behind calibration curves and corner plots, where there is a choice.
-SHOWN_PAIRS = 50
-# Methods in corner plots.
-CORNERS = ("NPE", "RoPE", "stack", "prior")
 # The methods of the picture of all tasks: what a user starts from, what is tuned on
 # pairs, the rivals of 2025 and 2026, the paper's method and our default.
 SHOWN = (
@@ -51,8 +44,6 @@ SHOWN = (
 )
 # Panels side by side, so that they can be read at the width of a page.
 SHOWN_COLUMNS = 4
-# More parameters than these make a corner plot that nobody can read.
-MAX_PARAMETERS = 6
 
 
 class LPPAxis:
@@ -79,32 +70,24 @@ class LPPAxis:
         return self.prior + self.unit * np.where(height >= 0, height, below)
 
 
-def draw_all(suite: Suite, results: Results) -> list[Path]:
-    """Draw the figures of a suite beside its table; return their files."""
-    rows = finished(results.rows)
-    if not len(rows):
-        return []
-    arrays = results.arrays()
-    figures = {suite.x_axis: curves(suite.x_axis, rows)}
-    figures["calibration"] = _coverage(rows, arrays)
-    figures |= _corners(rows, arrays)
-    paths = {results.folder / f"{name}.png": one for name, one in figures.items()}
-    for path, figure in paths.items():
-        _save(figure, path)
-    return list(paths)
+def draw_suite(suite: Suite, rows: pd.DataFrame, folder: Path) -> None:
+    """Draw the scores of a suite into a folder, if it has any."""
+    rows = finished(known(rows))
+    if len(rows):
+        _save(curves(suite.x_axis, rows), folder / f"{suite.x_axis}.png")
 
 
-def draw_overview(published: Published, folder: Path) -> None:
-    """Draw scores on all tasks, and ranks over tasks, into a folder."""
+def draw_overview(published: Published) -> None:
+    """Draw scores on all tasks, and ranks over tasks, beside the tables."""
     rows = finished(published.main)
     order = {task: place for place, task in enumerate(LETTERS)}
     shown = rows[rows["method"].isin(SHOWN)].sort_values(
         "task", kind="stable", key=lambda tasks: tasks.map(order)
     )
     figure = curves("n_calibration", shown, max_columns=SHOWN_COLUMNS)
-    _save(figure, folder / "methods.png")
+    _save(figure, published.folder / "methods.png")
     ranks = relative_ranks(published.main, beside=STACK)
-    _save(rank_figure(ranks), folder / "ranks.png")
+    _save(rank_figure(ranks), published.folder / "ranks.png")
 
 
 def _save(figure: Figure, path: Path) -> None:
@@ -261,74 +244,6 @@ def _position(axis: str, cell: Cell) -> float | None:
 
 def _is_option(axis: str) -> bool:
     return axis not in ("n_calibration", "gamma", "tau")
-
-
-# Calibration curves and corner plots ------------------------------------------------
-
-
-Arrays = dict[Cell, dict[str, np.ndarray]]
-
-
-def _shown(
-    rows: pd.DataFrame, arrays: Arrays, name: str
-) -> dict[tuple[str, ...], dict[str, Cell]]:
-    """By task: a cell of each method, all with about as many calibration pairs."""
-    shown: dict[tuple[str, ...], dict[str, Cell]] = {}
-    for where, there in rows.groupby(WHERE, sort=False):
-        nearest = {
-            method: min(part.index, key=_distance)
-            for method, part in there.groupby("method", sort=False)
-        }
-        shown[where] = {n: c for n, c in nearest.items() if name in arrays[c]}
-    return {where: cells for where, cells in shown.items() if cells}
-
-
-def _distance(cell: Cell) -> tuple[Any, ...]:
-    pairs = abs(cell.n_calibration - SHOWN_PAIRS)
-    return pairs, cell.cost_scale != "simulated", -(cell.tau or 0), cell.repetition
-
-
-def _coverage(rows: pd.DataFrame, arrays: Arrays) -> Figure:
-    shown = _shown(rows, arrays, "coverage")
-    options = {"columns": MAX_COLUMNS, "width": 3.6, "height": 3.6}
-    figure, panels = panel_grid(len(shown), **options)
-    levels = np.arange(1, 100) / 100
-    seen: dict[str, Any] = {}
-    for part, (where, cells) in zip(panels, shown.items(), strict=True):
-        part.plot([0, 1], [0, 1], color="0.6", lw=0.8)
-        for name, cell in cells.items():
-            colour, line, _ = _style(cell)
-            curve = arrays[cell]["coverage"]
-            (handle,) = part.plot(levels, curve, color=colour, ls=line, lw=1.4)
-            seen.setdefault(name, handle)
-        part.set(xlim=(0, 1), ylim=(0, 1), box_aspect=1)
-        part.set_title("\n".join(data_in_words(*where)))
-        part.set_xlabel("credible level")
-    panels[0].set_ylabel("share of true parameters inside")
-    _add_legend(figure, seen)
-    return figure
-
-
-def _corners(rows: pd.DataFrame, arrays: Arrays) -> dict[str, Figure]:
-    figures = {}
-    for where, cells in _shown(rows, arrays, "samples").items():
-        if "RoPE" not in cells:
-            continue
-        scores = rows["acauc_per_parameter"][cells["RoPE"]].split("; ")
-        names = [score.split("=")[0] for score in scores]
-        shown = slice(MAX_PARAMETERS)
-        samples = {
-            name: torch.from_numpy(arrays[cell]["samples"])[:, shown]
-            for name, cell in cells.items()
-            if name in CORNERS
-        }
-        prior = samples.pop("prior", None)
-        theta = torch.from_numpy(arrays[cells["RoPE"]]["theta"])[shown]
-        file = re.sub(r"[^\w.-]", "_", "-".join(data_in_words(*where)))
-        figures[f"corner-{file}"] = plots.pair_plot(
-            samples, theta, prior=prior, parameter_names=names[shown]
-        )
-    return figures
 
 
 # Ranks -------------------------------------------------------------------------------

@@ -3,11 +3,12 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from benchmarks.cases import Case
 from sbi_rope.baselines import (
     FMCPE,
     FRISBI,
@@ -20,7 +21,6 @@ from sbi_rope.baselines import (
     FinetunedNPE,
     JointNPE,
     Method,
-    OTOnly,
     PlainNPE,
     PriorBaseline,
     ReferenceNPE,
@@ -31,20 +31,6 @@ from sbi_rope.baselines import (
 from sbi_rope.discrepancy.correction import Space
 from sbi_rope.methods import DiscrepancyNPE
 from sbi_rope.training.fit import History
-
-if TYPE_CHECKING:
-    from benchmarks.cases import Case
-
-__all__ = [
-    "GIVEN_PRIOR_STACK",
-    "METHODS",
-    "OBSERVED_STACK",
-    "STACK",
-    "STACKS",
-    "Entry",
-    "append_data",
-    "methods_where",
-]
 
 # Tasks whose observations are statistics: NNPE's noise is on them, not on h(x).
 STATISTICS = ("cs", "sir", "linear_gaussian", "ocean_colour")
@@ -69,10 +55,7 @@ LOOK_UP = (
 # learns from the test set without its labels.
 STACK, GIVEN_PRIOR_STACK = "stack", "stack, given prior"
 OBSERVED_STACK = "stack with x_o"
-# They had RVNP, or couplings of the test set, among their candidates, up to commit
-# 616aef8.
-PAST_STACKS = ("stack with RVNP", "stack of a batch")
-STACKS = (STACK, GIVEN_PRIOR_STACK, OBSERVED_STACK, *PAST_STACKS)
+STACKS = (STACK, GIVEN_PRIOR_STACK, OBSERVED_STACK)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,50 +68,21 @@ class Entry:
         pairs: Whether it sees calibration pairs.
         observations: Whether it sees the test observations, without their labels.
         couples: Whether it has gamma and tau.
-        tasks: The only tasks that it can be run on; None for all.
-        extra: Whether it is run only where it is asked for by name.
         ours: Whether it is of this package alone: no paper describes it.
-        past: Whether it is gone, and only its results are left.
     """
 
     style: tuple[str, str, str | None]
-    build: "Callable[[Case], Method] | None" = None
+    build: Callable[[Case], Method] | None = None
     pairs: bool = False
     observations: bool = False
     couples: bool = False
-    tasks: tuple[str, ...] | None = None
-    extra: bool = False
     ours: bool = False
-    past: bool = False
-
-
-def methods_where(holds: Callable[[Entry], object]) -> tuple[str, ...]:
-    """Return the names of methods with a property, in the order of tables."""
-    return tuple(name for name, entry in METHODS.items() if holds(entry))
-
-
-def append_data(method: Method, name: str, case: "Case") -> tuple[int, bool]:
-    """Give a method all data that it can see.
-
-    Returns:
-        The number of simulations of NPE behind it, and whether it starts from the NPE
-        that methods share.
-    """
-    if method.needs_simulations:
-        stored = name in LOOK_UP
-        method.append_simulations(*(case.stored if stored else case.simulations))
-    if "calibration" in method.sees:
-        method.append_calibration(*case.calibration)
-    if "observations" in method.sees:
-        method.append_observations(case.test_set[1])
-    count = len(case.simulations[0]) if "simulations" in method.sees else 0
-    return count, method.starts_from_npe
 
 
 # How methods are constructed ----------------------------------------------------------
 
 
-def _physics(case: "Case") -> Callable[[Tensor], Tensor]:
+def _physics(case: Case) -> Callable[[Tensor], Tensor]:
     """Return the simulator without noise and nuisances, differentiable in theta."""
     simulator: Any = case.task.get_simulator()
     if case.task.name == "light_tunnel":
@@ -141,19 +95,19 @@ def _physics(case: "Case") -> Callable[[Tensor], Tensor]:
     return at_rest
 
 
-def _noise_on(case: "Case") -> Any:
+def _noise_on(case: Case) -> Any:
     return "input" if case.task.name in STATISTICS else "embedding"
 
 
-def _published_noise(case: "Case") -> float:
+def _published_noise(case: Case) -> float:
     return 0.5 if case.task.name == "wind_tunnel" else 0.05
 
 
-def _short_space(case: "Case", most: int) -> Space:
+def _short_space(case: Case, most: int) -> Space:
     return "input" if math.prod(case.task.x_shape) <= most else "embedding"
 
 
-def _from_scratch(case: "Case") -> tuple[Any, Any]:
+def _from_scratch(case: Case) -> tuple[Any, Any]:
     return case.task.get_prior(), case.builder
 
 
@@ -177,7 +131,7 @@ def _discrepancy(
     *,
     kind: type[DiscrepancyNPE] = DiscrepancyNPE,
     learn_prior: bool = False,
-) -> "Callable[[Case], Method]":
+) -> Callable[[Case], Method]:
     """Return how a variant is constructed; it corrects x where it is short if None."""
     # Where there is no simulator, simulations are appended.
     return lambda case: kind.from_posterior(
@@ -189,13 +143,13 @@ def _discrepancy(
     )
 
 
-def _then_finetuned(case: "Case") -> Method:
+def _then_finetuned(case: Case) -> Method:
     method: Any = _discrepancy(kind=_ThenFinetuned)(case)
     method.own_training = case.settings.own_training
     return method
 
 
-def _variational(*, shift: bool) -> "Callable[[Case], Method]":
+def _variational(*, shift: bool) -> Callable[[Case], Method]:
     """Return how RVNP is constructed, with errors as published or with an offset."""
     return lambda case: RVNP.from_posterior(
         case.npe,
@@ -230,7 +184,6 @@ METHODS: dict[str, Entry] = {
     # wider than what they are made from.
     "RNPE": Entry(
         style=("#8B4513", ":", None),
-        extra=True,
         build=lambda case: RNPE.from_posterior(
             case.npe, noise_on=_short_space(case, MAX_STATISTICS)
         ),
@@ -300,7 +253,6 @@ METHODS: dict[str, Entry] = {
         style=("#882255", "--", "h"),
         pairs=True,
         ours=True,
-        tasks=("cs", "light_tunnel_sensors", "linear_gaussian", "ocean_colour", "sir"),
         build=_discrepancy("input"),
     ),
     "discrepancy (tuned)": Entry(
@@ -360,8 +312,6 @@ METHODS: dict[str, Entry] = {
         style=("#117733", "-.", "P"),
         pairs=True,
         observations=True,
-        tasks=("pendulum", "light_tunnel"),
-        extra=True,
         build=lambda case: HVAE.from_posterior(
             case.npe, physics=_physics(case), width=HVAE_WIDTH
         ),
@@ -373,22 +323,11 @@ METHODS: dict[str, Entry] = {
             case.npe, simulator=case.simulator, finetuner=case.settings.finetuner
         ),
     ),
-    "OT-only": Entry(
-        style=("#56B4E9", "--", "s"),
-        observations=True,
-        couples=True,
-        build=lambda case: OTOnly.from_posterior(case.npe, simulator=case.simulator),
-    ),
+    "OT-only": Entry(style=("#56B4E9", "--", "s"), observations=True, couples=True),
     "RoPE": Entry(
         style=("#0072B2", "-", "o"), pairs=True, observations=True, couples=True
     ),
     STACK: Entry(style=("black", "-", "*"), pairs=True),
-    GIVEN_PRIOR_STACK: Entry(style=("black", "-.", "*"), pairs=True, extra=True),
+    GIVEN_PRIOR_STACK: Entry(style=("black", "-.", "*"), pairs=True),
     OBSERVED_STACK: Entry(style=("black", ":", "*"), pairs=True, observations=True),
-    **{
-        name: Entry(style=style, pairs=True, observations=True, past=True)
-        for name, style in zip(
-            PAST_STACKS, (("0.5", ":", "*"), ("black", "--", "*")), strict=True
-        )
-    },
 }

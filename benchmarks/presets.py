@@ -10,8 +10,6 @@ from sbi_rope import CalibrationFinetuner
 from sbi_rope.baselines import Training
 from sbi_rope.tasks import Task
 
-__all__ = ["PRESETS", "Settings"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
@@ -22,7 +20,6 @@ class Settings:
         training: How these are trained.
         n_test: Test observations, or all there are if that is less.
         num_samples: Posterior samples of each behind the calibration scores.
-        c2st_observations: Test observations that C2ST is a mean over.
         light_net: Whether the small embedding net of the task is used.
         flow: Name of the flow for sbi's ``posterior_nn``.
         flow_options: Its options.
@@ -36,7 +33,6 @@ class Settings:
     training: Training
     n_test: int = 1000
     num_samples: int = 500
-    c2st_observations: int = 5
     light_net: bool = True
     flow: str = "nsf"
     flow_options: dict[str, Any] = field(default_factory=lambda: {"num_transforms": 2})
@@ -68,7 +64,6 @@ def smoke(task: Task) -> Settings:
         training=training,
         n_test=40,
         num_samples=50,
-        c2st_observations=1,
         flow="maf",
         flow_options={"num_transforms": 1, "hidden_features": 10},
         finetuner=CalibrationFinetuner(max_num_epochs=20, simulations_per_target=5),

@@ -9,29 +9,13 @@ import numpy as np
 import pandas as pd
 from scipy.stats import t as student
 
-from benchmarks.cells import Suite, list_suites, load_suite
 from benchmarks.methods import METHODS, STACK, STACKS
 from benchmarks.store import Results
-
-__all__ = [
-    "FIXED",
-    "LETTERS",
-    "MAX_PAIRS",
-    "PAPER",
-    "SIZE",
-    "Comparison",
-    "Published",
-    "Setting",
-    "against_candidates",
-    "compare",
-    "finished",
-    "half_width",
-    "mean",
-    "num_repetitions",
-    "relative_ranks",
-]
+from benchmarks.suites import Suite, list_suites, load_suite
 
 SIZE = 50
+# Where fewer than 200 pairs are recorded, 150 take their place.
+MOST = (150, 200)
 # The paper's letters; from G on they are ours.
 LETTERS = {
     "cs": "A",
@@ -79,13 +63,10 @@ class Published:
     @classmethod
     def read(cls, folder: Path) -> "Published":
         """Read the tables in a folder; a suite without one has no rows."""
-        suites = {name: load_suite(name) for name in list_suites()}
-        # Of suites that are gone, too.
-        there = {path.parent.name for path in folder.glob("*/results.csv")}
-        if not there:
+        if not [*folder.glob("*/results.csv")]:
             raise SystemExit(f"No results in {folder}. Use `run` first, or --out.")
-        names = sorted({*suites, *there})
-        rows = {name: Results(folder / name).rows for name in names}
+        suites = {name: load_suite(name) for name in list_suites()}
+        rows = {name: Results(folder / name).rows for name in suites}
         return cls(folder, suites, rows)
 
     def select(
@@ -99,7 +80,8 @@ class Published:
     ) -> pd.DataFrame:
         """Return the rows of a method with so many pairs or none, one a repetition."""
         rows = self.rows[suite]
-        chosen = (rows["method"] == method) & rows["n_calibration"].isin([0, size])
+        sizes = [0, *MOST] if size in MOST else [0, size]
+        chosen = (rows["method"] == method) & rows["n_calibration"].isin(sizes)
         for name, value in fields.items():
             chosen &= rows[name] == value
         return rows[chosen & _with_setting(rows, setting)]
@@ -107,7 +89,7 @@ class Published:
     @property
     def main(self) -> pd.DataFrame:
         """What was run in the suite `main`, with one setting of the couplings."""
-        rows = self.rows["main"]
+        rows = known(self.rows["main"])
         return rows[_with_setting(rows, FIXED) & rows["task"].isin([*LETTERS])]
 
     def name(self, task: str, *, suite: str = "main") -> str:
@@ -121,6 +103,11 @@ def _with_setting(rows: pd.DataFrame, setting: Setting) -> pd.Series:
     gamma, tau, scale = setting
     same = (rows["gamma"] == gamma) & (rows["tau"] == tau)
     return rows["gamma"].isna() | (same & (rows["cost_scale"] == scale))
+
+
+def known(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of methods that are not gone."""
+    return rows[rows["method"].isin([*METHODS])]
 
 
 def finished(rows: pd.DataFrame) -> pd.DataFrame:
@@ -191,27 +178,19 @@ def compare(rows: pd.DataFrame, method: str = STACK) -> list[Comparison]:
         of_task = rows[rows["task"] == task]
         for size in sorted(ours["n_calibration"][ours["task"] == task].unique()):
             there = of_task[of_task["n_calibration"].isin([0, size])]
-            scores = {
-                name: part.groupby("repetition", sort=False)["lpp_z"].mean()
-                for name, part in there.groupby("method", sort=False)
-            }
+            scores = there.pivot_table("lpp_z", "repetition", "method", sort=False)
+            own = scores.pop(method)
             gaps = {
-                name: _gap(scores[method], scores[name])
-                for name in scores
-                if name not in (*NO_RIVALS, method)
+                # 0 where both are -inf.
+                str(name): (own - other).where(own != other, 0.0).dropna()
+                for name, other in scores.items()
+                if name not in NO_RIVALS
             }
             gaps = {name: gap for name, gap in gaps.items() if len(gap)}
             if gaps:
-                own = there[there["method"] == method]
-                compared.append(Comparison(task, int(size), own, gaps))
+                rows_of_own = there[there["method"] == method]
+                compared.append(Comparison(task, int(size), rows_of_own, gaps))
     return compared
-
-
-def _gap(first: pd.Series, second: pd.Series) -> pd.Series:
-    """Return how far one method is above another; 0 where both are -inf."""
-    common = first.index[first.index.isin(second.index)]
-    one, other = first[common], second[common]
-    return (one - other).where(one != other, 0.0)
 
 
 def half_width(values: np.ndarray) -> float:
@@ -253,34 +232,3 @@ def relative_ranks(rows: pd.DataFrame, *, beside: str) -> pd.DataFrame:
             data = one["task"], one["n_calibration"], one["repetition"]
             of_each[data] = (ranks - 1) / (len(there) - 1)
     return pd.DataFrame(of_each).T.groupby(level=0).mean().T
-
-
-# A stack against its candidates -------------------------------------------------------
-
-
-def against_candidates(results: Results) -> pd.DataFrame:
-    """Compare the stacks of a suite with their candidates, in LPP of the test set.
-
-    Returns:
-        A line for each stack: its `size`, how far it is above the `best` of its
-        candidates *chosen on the test set*, above the better of prior and NPE
-        (`basics`), and above its own `held_out` score, in standard errors of that.
-    """
-    rows, found = finished(results.rows), []
-    for cell, arrays in results.arrays().items():
-        if cell.method != STACK or "candidates" not in arrays:
-            continue
-        lpp = rows["lpp_z"][cell]
-        names = [str(name) for name in arrays["candidates"]]
-        test = dict(zip(names, arrays["test"].tolist(), strict=False))
-        basics = [test[name] for name in ("prior", "NPE") if name in test]
-        held_out, error = arrays["held_out"][-1], arrays["held_out_error"][-1]
-        found.append(
-            {
-                "size": cell.n_calibration,
-                "best": lpp - max(test.values()),
-                "basics": lpp - max(basics, default=-np.inf),
-                "held_out": (lpp - held_out) / error,
-            }
-        )
-    return pd.DataFrame(found, columns=["size", "best", "basics", "held_out"])

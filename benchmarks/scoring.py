@@ -1,183 +1,138 @@
 """Scores of cells on the test set, and what they cost."""
 
+import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-import torch
 
 from benchmarks.cases import Case, Pairs
 from benchmarks.cells import Cell
 from benchmarks.methods import (
     GIVEN_PRIOR_STACK,
+    LOOK_UP,
     METHODS,
     OBSERVED_STACK,
-    STACK,
     STACKS,
-    append_data,
 )
+from benchmarks.store import Result
 from sbi_rope import RoPE, SinkhornCoupler
-from sbi_rope.baselines import ReferenceNPE
-from sbi_rope.metrics import Evaluation, evaluate
+from sbi_rope.baselines import Method, ReferenceNPE
+from sbi_rope.metrics import evaluate
 from sbi_rope.stacking import StackedPosterior, default_candidates, stack
 
-__all__ = ["Failure", "Score", "scores"]
 
+def score(case: Case, cells: Sequence[Cell]) -> Iterator[Result]:
+    """Score cells that share a training, each when it is asked for.
 
-@dataclass(frozen=True, kw_only=True)
-class Score:
-    """The scores of a cell on the test set, and what it cost.
-
-    Attributes:
-        cell: The cell.
-        posterior: The posterior that was scored.
-        test_set: The pairs it was scored on.
-        evaluation: Its scores.
-        train_seconds: Training, without that of the NPE that methods share; of RoPE the
-            fine-tuning, which the couplings of a sweep share.
-        couple_seconds: Simulating and coupling.
-        test_seconds: Sampling and evaluating the posteriors of the test set.
-        num_simulations: Simulations behind the posterior, those of the shared NPE
-            included.
-        shares_npe: Whether it starts from the NPE that methods share.
-        converged: Whether the coupling has converged; True without one.
-        arrays: What else is kept of it, by name.
-    """
-
-    cell: Cell
-    posterior: Any
-    test_set: Pairs
-    evaluation: Evaluation
-    train_seconds: float
-    test_seconds: float
-    num_simulations: int
-    couple_seconds: float = 0.0
-    shares_npe: bool = True
-    converged: bool = True
-    arrays: dict[str, np.ndarray] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Failure:
-    """A cell that could not be scored, and why."""
-
-    cell: Cell
-    error: Exception
-
-
-def scores(case: Case, cells: Sequence[Cell]) -> Iterator[Score | Failure]:
-    """Score cells that differ in gamma and tau only, each when it is asked for.
-
-    A posterior that cannot be scored is a failure of its cell alone.
+    A coupling that fails is a failure of its cell alone.
 
     Raises:
         Exception: Whatever stops all cells, such as a failing training.
     """
-    method = case.cell.method
-    if METHODS[method].couples:
-        yield from _coupled_scores(case, cells)
-    else:
-        score = _stack_score if method in STACKS else _score
-        for cell in cells:
-            yield score(case, cell)
+    if METHODS[case.cell.method].couples:
+        return _score_couplings(case, cells)
+    score_one = _score_stack if case.cell.method in STACKS else _score_method
+    return (score_one(case, cell) for cell in cells)
 
 
-def _score(case: Case, cell: Cell) -> Score:
-    pairs = case.test_set
-    count = _Count(case)
+def failure(cell: Cell, error: Exception) -> Result:
+    """Return the result of a cell that could not be scored."""
+    text = f"{type(error).__name__}: {error}"
+    return Result({**asdict(cell), "status": "failed", "error": text}, {})
+
+
+def _score_method(case: Case, cell: Cell) -> Result:
     build = METHODS[cell.method].build
     assert build is not None
     method = build(case)
     start = time.perf_counter()
-    used, shares_npe = append_data(method, cell.method, case)
+    _append_data(method, case)
     method.train(seed=case.seed, show_progress_bars=False)
     posterior = method.build_posterior()
-    seconds = time.perf_counter() - start
-    used += count.new
+    costs = {
+        "seconds_npe": case.npe_seconds if method.starts_from_npe else 0.0,
+        "seconds_train": time.perf_counter() - start,
+        "num_simulations": case.num_simulated
+        + ("simulations" in method.sees) * len(case.simulations[0]),
+    }
+    pairs = case.test_set
     if isinstance(method, ReferenceNPE):
         if case.simulator is None:
-            assert case.held_out is not None
             pairs = case.held_out
         else:
             pairs = method.simulated_test_set(pairs[0], case.simulator, seed=case.seed)
-    return _scored(
-        case,
-        cell,
-        posterior,
-        pairs,
-        train_seconds=seconds,
-        num_simulations=used,
-        shares_npe=shares_npe,
-    )
+    return _result(case, cell, posterior, pairs, **costs)
 
 
-def _coupled_scores(case: Case, cells: Sequence[Cell]) -> Iterator[Score | Failure]:
-    count = _Count(case)
-    start = time.perf_counter()
-    rope = _trained_rope(case)
-    train_seconds = time.perf_counter() - start
-    trained = count.new
-    for cell in cells:
-        before, start = count.new, time.perf_counter()
-        try:
-            posterior = _coupled(rope, case, cell)
-            couple_seconds = time.perf_counter() - start
-            used = len(case.simulations[0]) + trained + count.new - before
-            yield _scored(
-                case,
-                cell,
-                posterior,
-                case.test_set,
-                train_seconds=train_seconds,
-                couple_seconds=couple_seconds,
-                num_simulations=used,
-                converged=posterior.coupling.converged,
-            )
-        except Exception as error:  # such as no mass inside the prior's support
-            yield Failure(cell=cell, error=error)
-
-
-def _coupled(rope: RoPE, case: Case, cell: Cell) -> Any:
-    assert cell.gamma is not None
-    assert cell.tau is not None
-    coupler = SinkhornCoupler(
-        gamma=cell.gamma,
-        tau=cell.tau,
-        cost_scale=cell.cost_scale,  # type: ignore[arg-type]
-    )
-    return rope.build_posterior(
-        case.test_set[1],
-        coupler=coupler,
-        seed=case.seed,
-        require_convergence=False,
-        show_progress_bars=False,
-    )
-
-
-def _trained_rope(case: Case) -> RoPE:
-    """Return what couples in RoPE and OT-only, trained as far as it is."""
-    if not METHODS[case.cell.method].pairs:
-        return _rope_of(case)
-    rope = _rope_of(case).append_calibration(*case.calibration)
-    return rope.train(seed=case.seed, show_progress_bars=False)
+def _append_data(method: Method, case: Case) -> None:
+    """Give a method all data that it can see."""
+    if method.needs_simulations:
+        stored = case.cell.method in LOOK_UP
+        method.append_simulations(*(case.stored if stored else case.simulations))
+    if "calibration" in method.sees:
+        method.append_calibration(*case.calibration)
+    if "observations" in method.sees:
+        method.append_observations(case.test_set[1])
 
 
 def _rope_of(case: Case) -> RoPE:
-    """Return RoPE on a case, without calibration pairs."""
-    return RoPE(
+    """Return RoPE on a case, with the pairs that its method sees."""
+    rope = RoPE(
         case.npe,
         simulator=case.simulator,
         simulations=case.stored if case.simulator is None else None,
         finetuner=case.settings.finetuner,
     )
+    if METHODS[case.cell.method].pairs:
+        rope.append_calibration(*case.calibration)
+    return rope
 
 
-def _stack_score(case: Case, cell: Cell) -> Score:
-    count = _Count(case)
+def _score_couplings(case: Case, cells: Sequence[Cell]) -> Iterator[Result]:
+    rope = _rope_of(case)
     start = time.perf_counter()
-    rope = _rope_of(case).append_calibration(*case.calibration)
+    if METHODS[case.cell.method].pairs:
+        rope.train(seed=case.seed, show_progress_bars=False)
+    train_seconds = time.perf_counter() - start
+    trained = case.num_simulated
+    for cell in cells:
+        before, start = case.num_simulated, time.perf_counter()
+        assert cell.gamma is not None
+        assert cell.tau is not None
+        try:
+            posterior = rope.build_posterior(
+                case.test_set[1],
+                coupler=SinkhornCoupler(
+                    gamma=cell.gamma,
+                    tau=cell.tau,
+                    cost_scale=cell.cost_scale,  # type: ignore[arg-type]
+                ),
+                seed=case.seed,
+                require_convergence=False,
+                show_progress_bars=False,
+            )
+            made = trained + case.num_simulated - before
+            yield _result(
+                case,
+                cell,
+                posterior,
+                case.test_set,
+                converged=posterior.coupling.converged,
+                seconds_npe=case.npe_seconds,
+                seconds_train=train_seconds,
+                seconds_couple=time.perf_counter() - start,
+                num_simulations=len(case.simulations[0]) + made,
+            )
+        except Exception as error:  # such as no mass inside the prior's support
+            yield failure(cell, error)
+
+
+def _score_stack(case: Case, cell: Cell) -> Result:
+    rope = _rope_of(case)
+    start = time.perf_counter()
     candidates = None
     if cell.method == GIVEN_PRIOR_STACK:
         candidates = default_candidates(rope, learn_prior=False)
@@ -190,52 +145,61 @@ def _stack_score(case: Case, cell: Cell) -> Score:
         seed=case.seed,
         show_progress_bars=False,
     )
-    train_seconds = time.perf_counter() - start
-    score = _scored(
-        case,
-        cell,
-        posterior,
-        case.test_set,
-        train_seconds=train_seconds,
-        num_simulations=len(case.simulations[0]) + count.new,
-    )
-    return replace(score, arrays=_candidates(case, posterior))
+    costs = {
+        "seconds_npe": case.npe_seconds,
+        "seconds_train": time.perf_counter() - start,
+        "num_simulations": len(case.simulations[0]) + case.num_simulated,
+    }
+    beside = _beside_candidates(case, posterior)
+    return _result(case, cell, posterior, case.test_set, **costs, **beside)
 
 
-def _candidates(case: Case, posterior: StackedPosterior) -> dict[str, np.ndarray]:
-    """Return how each candidate of a stack did, on held-out pairs and on the test set.
+def _beside_candidates(case: Case, posterior: StackedPosterior) -> dict[str, float]:
+    """Return what a stack is compared with, in standard deviations of the prior.
 
-    The stack itself comes last. In standard deviations of the prior.
+    These are its score on hold-out pairs, and on the test set the scores of the best of
+    its candidates and of the better of prior and NPE.
     """
-    report = posterior.report
     unit = float(case.task.prior_std.log().sum())
-    test = posterior.candidate_log_probs(*case.test_set)
-    stack = report.held_out.log_prob[:, None]
-    scores = torch.cat([report.log_scores, stack], dim=1)
+    report = posterior.report
+    held_out = report.held_out.log_prob
+    lpp = posterior.candidate_log_probs(*case.test_set).mean(dim=0) + unit
+    of_each = dict(zip(report.names, lpp.tolist(), strict=True))
+    basics = [of_each[name] for name in ("prior", "NPE") if name in of_each]
     return {
-        "candidates": np.array([*report.names, STACK]),
-        "weights": np.array([*report.weights.weights.tolist(), np.nan]),
-        "held_out": (scores.mean(dim=0) + unit).cpu().numpy(),
-        "held_out_error": (scores.std(dim=0) / len(scores) ** 0.5).cpu().numpy(),
-        "test": (test.mean(dim=0) + unit).cpu().numpy(),
+        "held_out": float(held_out.mean()) + unit,
+        "held_out_error": float(held_out.std()) / len(held_out) ** 0.5,
+        "best_candidate": max(of_each.values()),
+        "best_basic": max(basics, default=-math.inf),
     }
 
 
-class _Count:
-    """How many simulations were made since."""
+def _result(
+    case: Case,
+    cell: Cell,
+    posterior: Any,
+    pairs: Pairs,
+    *,
+    seconds_npe: float,
+    seconds_train: float,
+    seconds_couple: float = 0.0,
+    converged: bool = True,
+    **others: float,
+) -> Result:
+    """Score a posterior.
 
-    def __init__(self, case: Case) -> None:
-        self.simulator = case.simulator
-        self.before = 0 if self.simulator is None else self.simulator.count
-
-    @property
-    def new(self) -> int:
-        return 0 if self.simulator is None else self.simulator.count - self.before
-
-
-def _scored(
-    case: Case, cell: Cell, posterior: Any, pairs: Pairs, **costs: Any
-) -> Score:
+    Args:
+        case: The data.
+        cell: The cell.
+        posterior: Its posterior.
+        pairs: The pairs to score it on.
+        seconds_npe: Training of the NPE that methods share; 0 for others.
+        seconds_train: All other training; of RoPE the fine-tuning, which the couplings
+            of a sweep share.
+        seconds_couple: Simulating and coupling.
+        converged: Whether the coupling has converged; True without one.
+        others: More columns of the row.
+    """
     start = time.perf_counter()
     evaluation = evaluate(
         posterior,
@@ -244,11 +208,28 @@ def _scored(
         num_samples=case.settings.num_samples,
         seed=case.seed,
     )
-    return Score(
-        cell=cell,
-        posterior=posterior,
-        test_set=pairs,
-        evaluation=evaluation,
-        test_seconds=time.perf_counter() - start,
-        **costs,
-    )
+    log_prob, root = evaluation.log_prob, len(evaluation) ** 0.5
+    acauc = zip(case.task.parameter_names, evaluation.acauc_of_parameters, strict=True)
+    row = {
+        **asdict(cell),
+        "status": "finished",
+        **evaluation.as_row(),
+        "lpp_median": float(log_prob.quantile(0.5, interpolation="nearest")),
+        "neg_inf_fraction": float(log_prob.isneginf().double().mean()),
+        "lpp_standard_error": float(log_prob.std()) / root,
+        "acauc_standard_error": float(evaluation.levels.mean(dim=1).std()) / root,
+        "acauc_per_parameter": "; ".join(f"{k}={one.mean:.4f}" for k, one in acauc),
+        "converged": converged,
+        "n_test": len(pairs[0]),
+        "stand_in": case.task.stand_in,
+        "seconds_npe": round(seconds_npe, 1),
+        "seconds_train": round(seconds_train, 2),
+        "seconds_couple": round(seconds_couple, 2),
+        "seconds_test": round(time.perf_counter() - start, 2),
+        **others,
+    }
+    arrays = {
+        "log_probs": log_prob.cpu().numpy(),
+        "coverage": evaluation.coverage.mean(dim=1).cpu().numpy().astype(np.float32),
+    }
+    return Result(row, arrays)

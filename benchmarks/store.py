@@ -1,11 +1,11 @@
-"""Results of cells: a CSV file for each suite, with arrays beside it.
+"""Results of cells: a CSV file for each suite.
 
 A folder of results holds a folder for each suite, with `results.csv`, a row for each
-cell, and `arrays.npz`, where an array is named by its cell (`KEY/log_probs`).
+cell. Beside it is what the scores were made from: `arrays/KEY.npz` for a cell whose
+`key` is KEY. Nothing reads these but whoever wants to look closer.
 """
 
-import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,34 +16,28 @@ import pandas as pd
 from benchmarks.cells import Cell
 from sbi_rope.utils.files import write_atomically
 
-__all__ = ["WHERE", "Result", "Results"]
-
 CELL_COLUMNS = [field.name for field in fields(Cell)]
 COLUMNS = [
     *("suite", *CELL_COLUMNS, "status"),
     *("lpp", "lpp_z", "lpp_median", "lpp_standard_error", "neg_inf_fraction"),
     *("acauc", "acauc_standard_error", "acauc_per_parameter"),
-    *("expected_coverage_error", "c2st", "converged", "n_test", "stand_in"),
+    *("expected_coverage_error", "converged", "n_test", "stand_in"),
+    *("held_out", "held_out_error", "best_candidate", "best_basic"),
     *("seconds_npe", "seconds_train", "seconds_couple", "seconds_test"),
-    *("num_simulations", "peak_memory_mb", "device", "versions", "git_commit"),
-    *("finished_at", "error"),
+    *("num_simulations", "device", "versions", "git_commit", "finished_at", "error"),
 ]
 TEXTS = [
     *("suite", "task", "variant", "options", "preset", "method", "cost_scale"),
     *("status", "acauc_per_parameter", "device", "versions", "git_commit"),
     *("finished_at", "error"),
 ]
-# Cells with the same of these have the same data.
-WHERE = ["task", "variant", "options"]
-
-Arrays = dict[str, np.ndarray]
 
 
 class Result(NamedTuple):
     """The row of a cell and, if it is finished, its arrays."""
 
     row: dict[str, Any]
-    arrays: Arrays
+    arrays: dict[str, np.ndarray]
 
 
 class Results:
@@ -65,67 +59,38 @@ class Results:
             rows[name] = [_value(text) for text in rows[name]]
         return rows.infer_objects()
 
-    def arrays(self) -> dict[Cell, Arrays]:
-        """Return the arrays of each cell, by name."""
-        status = self._texts()["status"]
-        arrays: dict[Cell, Arrays] = {cell: {} for cell in status.index}
-        by_key = {
-            cell.key: parts
-            for cell, parts in arrays.items()
-            if status[cell] != "failed"
-        }
-        # What is not tidied yet comes last, because it is newer.
-        for path in (*self.folder.glob("*.npz"), *self.folder.glob("arrays/*.npz")):
-            with np.load(path) as archive:
-                for name in archive.files:
-                    key, _, part = name.partition("/")
-                    if key in by_key:
-                        by_key[key][part] = archive[name]
-        return arrays
-
     def add(self, results: Iterable[Result]) -> None:
-        """Add results, in place of earlier ones of the same cells.
-
-        The arrays come first: a cell that has a row is complete.
-        """
-        parts = [*results]
-        new = pd.DataFrame(
-            [[_as_text(part.row.get(name)) for name in COLUMNS] for part in parts],
-            columns=COLUMNS,
-            dtype=object,
-        ).assign(suite=self.folder.name)
-        new = new.set_index(_cells_of(new))
-        for cell, (_, arrays) in zip(new.index, parts, strict=True):
+        """Add results, in place of earlier ones of the same cells."""
+        results = [*results]
+        texts = [[_as_text(row.get(name)) for name in COLUMNS] for row, _ in results]
+        new = pd.DataFrame(texts, columns=COLUMNS, dtype=object)
+        new = new.assign(suite=self.folder.name).set_index(_cells_of(new))
+        # The arrays come first: a cell that has a row is complete.
+        for cell, (_, arrays) in zip(new.index, results, strict=True):
             if arrays:
-                _write_arrays(
-                    self.folder / "arrays" / f"{cell.key}.npz", {cell: arrays}
-                )
-        old = self._texts()
-        self._write(pd.concat([old[~old.index.isin(new.index)], new]))
+                path = self.folder / "arrays" / f"{cell.key}.npz"
+                with write_atomically(path) as temporary, temporary.open("wb") as file:
+                    np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+        self._add(new)
 
-    def take_over(self, cells: Sequence[Cell]) -> None:
-        """Copy results of cells that other suites in the same folder have."""
+    def take_over(self, cells: Collection[Cell]) -> None:
+        """Copy rows of cells that other suites in the same folder have."""
         for path in sorted(self.folder.parent.glob("*/results.csv")):
-            other = Results(path.parent)
-            rows = other._texts()
-            shared = rows[
-                rows.index.isin(cells) & ~rows.index.isin(self._texts().index)
-            ]
-            if len(shared):
-                arrays = other.arrays()
-                self.add(
-                    Result(row.to_dict(), arrays[cell])
-                    for cell, row in shared.iterrows()
-                )
+            rows, own = Results(path.parent)._texts(), self._texts()
+            shared = rows.index.isin(cells) & ~rows.index.isin(own.index)
+            if shared.any():
+                self._add(rows[shared].assign(suite=self.folder.name))
 
-    def tidy(self, order: Sequence[Cell]) -> None:
-        """Put the rows into the order of some cells, and all arrays into one file."""
+    def sort(self, order: Sequence[Cell]) -> None:
+        """Put the rows into the order of some cells."""
         places = {cell: number for number, cell in enumerate(order)}
         rows = self._texts()
         ranks = [places.get(cell, len(places)) for cell in rows.index]
         self._write(rows.iloc[np.argsort(ranks, kind="stable")])
-        _write_arrays(self.folder / "arrays.npz", self.arrays())
-        shutil.rmtree(self.folder / "arrays", ignore_errors=True)
+
+    def _add(self, new: pd.DataFrame) -> None:
+        old = self._texts()
+        self._write(pd.concat([old[~old.index.isin(new.index)], new]))
 
     def _texts(self) -> pd.DataFrame:
         """Read all as text, so that what is written again stays as it was."""
@@ -135,8 +100,9 @@ class Results:
         return texts.set_index(_cells_of(texts))
 
     def _write(self, texts: pd.DataFrame) -> None:
+        # Older tables lack columns, or have some that are not made any more.
         with write_atomically(self.path) as path:
-            texts.to_csv(path, index=False, lineterminator="\r\n")
+            texts.fillna("").to_csv(path, index=False, lineterminator="\r\n")
 
 
 def _value(text: str) -> Any:
@@ -151,26 +117,12 @@ def _as_text(value: Any) -> str:
 
 
 def _cells_of(texts: pd.DataFrame) -> pd.Index:
-    cells = [
-        Cell(
-            **row
-            | {name: int(row[name]) for name in ("n_calibration", "repetition")}
-            | {
-                name: float(row[name]) if row[name] else None
-                for name in ("gamma", "tau")
-            }
-        )
-        for row in texts[CELL_COLUMNS].to_dict("records")
-    ]
+    cells = []
+    for row in texts[CELL_COLUMNS].to_dict("records"):
+        for name in ("n_calibration", "repetition"):
+            row[name] = int(row[name])
+        for name in ("gamma", "tau"):
+            row[name] = float(row[name]) if row[name] else None
+        cells.append(Cell(**row))
     # Cells are no sequences, but an index of objects has to be asked for.
     return pd.Index(cells, dtype=object)
-
-
-def _write_arrays(path: Path, arrays: dict[Cell, Arrays]) -> None:
-    flat = {
-        f"{cell.key}/{name}": values
-        for cell, parts in arrays.items()
-        for name, values in parts.items()
-    }
-    with write_atomically(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **flat)  # type: ignore[arg-type]

@@ -8,16 +8,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
+from benchmarks import runner
 from benchmarks.__main__ import main
-from benchmarks.cases import Case, Sources
-from benchmarks.cells import Cell, load_suite
-from benchmarks.methods import METHODS
-from benchmarks.runner import Workplace, run_cells
-from benchmarks.scoring import Score, scores
+from benchmarks.cases import Case, Workplace
+from benchmarks.cells import Cell
+from benchmarks.methods import METHODS, STACKS
+from benchmarks.runner import code_version, run_cells
+from benchmarks.scoring import score
 from benchmarks.store import Results
+from benchmarks.suites import load_suite
 from sbi_rope import SinkhornCoupler
 from sbi_rope.baselines import OTOnly
 from tests.results import result_of
@@ -26,8 +29,6 @@ pytestmark = pytest.mark.usefixtures("rough_pictures")
 
 ROOT = Path(__file__).parents[2]
 SUITE = """
-title = "Tiny"
-question = "Nothing."
 preset = "smoke"
 repetitions = 1
 
@@ -39,14 +40,14 @@ gammas = { simulated = [0.1] }
 taus = [1.0, 0.9]
 """
 # What may differ between two runs of the same cell.
-CHANGING = ("seconds_", "peak_memory", "finished_at", "git_commit", "suite")
+CHANGING = ("seconds_", "finished_at", "git_commit", "suite")
 
 
-@pytest.fixture(scope="module")
-def suite_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("suite") / "tiny.toml"
+@pytest.fixture
+def suite_file(tmp_path: Path) -> str:
+    path = tmp_path / "tiny.toml"
     path.write_text(SUITE)
-    return path
+    return str(path)
 
 
 def rows_of(folder: Path) -> list[dict[str, str]]:
@@ -55,27 +56,6 @@ def rows_of(folder: Path) -> list[dict[str, str]]:
             {k: v for k, v in row.items() if not k.startswith(CHANGING)}
             for row in csv.DictReader(file)
         ]
-
-
-@pytest.fixture(scope="module")
-def uninterrupted(
-    suite_file: Path, tmp_path_factory: pytest.TempPathFactory
-) -> list[dict[str, str]]:
-    folder = tmp_path_factory.mktemp("uninterrupted")
-    main(["run", str(suite_file), "--out", str(folder)])
-    return rows_of(folder)
-
-
-@pytest.mark.slow
-def test_a_run_in_parts_gives_the_same_table(
-    suite_file: Path, uninterrupted: list[dict[str, str]], tmp_path: Path
-) -> None:
-    assert len(uninterrupted) == 7
-    assert {row["status"] for row in uninterrupted} == {"finished"}
-    command = ["run", str(suite_file), "--out", str(tmp_path)]
-    main([*command, "--method", "RoPE", "prior"])
-    main(command)
-    assert rows_of(tmp_path) == uninterrupted
 
 
 def test_status_counts_what_is_finished_and_what_is_not_run(
@@ -94,9 +74,8 @@ def test_status_counts_what_is_finished_and_what_is_not_run(
 @pytest.mark.medium
 def test_stored_people_are_shared_out_without_overlap(tmp_path: Path) -> None:
     cell = Cell(task="hemodynamics", preset="smoke", method="SBI")
-    place = Workplace(folder=tmp_path)
-    case = place.case(cell)
-    assert case.held_out is not None
+    place = Workplace(tmp_path)
+    case = Case(cell, place)
     held_out = set(case.held_out[0][:, 0].tolist())
     for pairs in (case.simulations, case.stored):
         assert held_out.isdisjoint(pairs[0][:, 0].tolist())
@@ -104,26 +83,15 @@ def test_stored_people_are_shared_out_without_overlap(tmp_path: Path) -> None:
     assert run_cells(cells, Results(tmp_path / "tiny"), place)["finished"] == 2
 
 
-@pytest.mark.medium
-def test_the_test_set_is_as_large_as_what_is_recorded(tmp_path: Path) -> None:
-    cell = Cell(task="hemodynamics", preset="standard", method="prior")
-    case = Case.of(cell, Sources(), tmp_path, "cpu")
-    recorded = case.task.num_recorded("test")
-    assert recorded is not None
-    assert recorded < case.settings.n_test
-    assert len(case.test_set[0]) == recorded
-
-
 def test_people_of_the_simulator_are_the_real_ones_where_it_is_right(
     tmp_path: Path,
 ) -> None:
     import sbi_rope.tasks.hemodynamics.data as package
 
-    sources = Sources(hemodynamics=Path(next(iter(package.__path__))))
+    people = Path(next(iter(package.__path__)))
     cell = Cell(task="hemodynamics", preset="smoke", method="stack", n_calibration=5)
-    right = replace(cell, variant="well_specified")
-    for one in (cell, right):
-        case = Case.of(one, sources, tmp_path, "cpu")
+    for one in (cell, replace(cell, variant="well_specified")):
+        case = Case(one, Workplace(tmp_path, hemodynamics=people))
         simulated = {tuple(theta) for theta in case.stored[0].tolist()}
         # In neither is anyone both simulated and observed.
         for theta, _ in (case.calibration, case.test_set):
@@ -131,27 +99,66 @@ def test_people_of_the_simulator_are_the_real_ones_where_it_is_right(
 
 
 @pytest.mark.medium
-def test_what_is_finished_is_not_computed_again(
-    suite_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_only_what_another_version_has_made_is_computed_again(
+    suite_file: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    command = ["run", str(suite_file), "--out", str(tmp_path), "--method", "prior"]
+    command = ["run", suite_file, "--out", str(tmp_path), "--method"]
     path = tmp_path / "tiny" / "results.csv"
-    main(command)
+    monkeypatch.setattr(runner, "code_version", lambda: "aaaaaaa")
+    main([*command, "prior"])
     before = path.read_bytes()
     capsys.readouterr()
-    main(command)
+    monkeypatch.setattr(runner, "code_version", lambda: "bbbbbbb")
+    main([*command, "prior"])
     assert "1 kept, 0 finished, 0 failed" in capsys.readouterr().out
     assert path.read_bytes() == before
-    main([*command, "--again"])
-    assert "0 kept, 1 finished, 0 failed" in capsys.readouterr().out
+    for count in ("0 kept, 2 finished", "2 kept, 0 finished"):
+        main([*command, "prior", "NPE", "--again"])
+        assert count in capsys.readouterr().out
+    assert {*Results(path.parent).rows["git_commit"]} == {"bbbbbbb"}
+    # Of changed code, too.
+    monkeypatch.setattr(runner, "code_version", lambda: "bbbbbbb+")
+    for _ in range(2):
+        main([*command, "prior", "--again"])
+        assert "0 kept, 1 finished" in capsys.readouterr().out
+
+
+def test_results_and_pages_make_no_other_version_of_the_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def git(*args: str) -> None:
+        user = ("-c", "user.name=a", "-c", "user.email=a@b.c")
+        subprocess.run(("git", *user, *args), cwd=tmp_path, check=True)
+
+    assert all((ROOT / path).exists() for path in runner.CODE)
+    monkeypatch.setattr(runner, "ROOT", tmp_path)
+    git("init", "-q")
+    versions = []
+    for name in ("sbi_rope/a.py", "benchmarks/results.csv", "benchmarks/cases.py"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("1")
+        git("add", ".")
+        git("commit", "-q", "-m", "-")
+        versions.append(code_version())
+    assert versions[0] == versions[1] != versions[2]
+    (tmp_path / "benchmarks" / "results.csv").write_text("2")
+    assert code_version() == versions[2]
+    (tmp_path / "sbi_rope" / "a.py").write_text("2")
+    assert code_version() == f"{versions[2]}+"
 
 
 @pytest.mark.slow
-def test_a_killed_run_resumes_to_the_same_table(
-    suite_file: Path, uninterrupted: list[dict[str, str]], tmp_path: Path
+def test_a_killed_run_resumes_to_the_table_of_one_that_was_not(
+    suite_file: str, tmp_path: Path
 ) -> None:
-    command = [sys.executable, "-m", "benchmarks", "run", str(suite_file)]
-    command += ["--out", str(tmp_path), "--jobs", "2"]
+    assert main(["run", suite_file, "--out", str(tmp_path / "whole")]) == 0
+    whole = rows_of(tmp_path / "whole")
+    assert len(whole) == 7
+    command = [sys.executable, "-m", "benchmarks", "run", suite_file, "--jobs", "2"]
+    command += ["--out", str(tmp_path)]
     with (tmp_path / "output").open("w") as output:
         process = subprocess.Popen(command, cwd=ROOT, stdout=output, stderr=output)
     results = Results(tmp_path / "tiny")
@@ -161,28 +168,12 @@ def test_a_killed_run_resumes_to_the_same_table(
     process.kill()
     process.wait()
     kept = len(results.rows)
-    assert 2 <= kept < len(uninterrupted)
+    assert 2 <= kept < len(whole)
     again = subprocess.run(
         command, cwd=ROOT, check=True, capture_output=True, text=True
     )
-    assert f"{kept} kept, {len(uninterrupted) - kept} finished" in again.stdout
-    assert rows_of(tmp_path) == uninterrupted
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("backend", ["loky", "dask"])
-def test_two_workers_give_the_same_table(
-    backend: str,
-    suite_file: Path,
-    uninterrupted: list[dict[str, str]],
-    tmp_path: Path,
-) -> None:
-    if backend == "dask":
-        pytest.importorskip("distributed")
-    command = [sys.executable, "-m", "benchmarks", "run", str(suite_file)]
-    command += ["--out", str(tmp_path), "--jobs", "2", "--backend", backend]
-    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
-    assert rows_of(tmp_path) == uninterrupted
+    assert f"{kept} kept, {len(whole) - kept} finished" in again.stdout
+    assert rows_of(tmp_path) == whole
 
 
 @pytest.mark.medium
@@ -192,9 +183,8 @@ def test_a_failing_method_does_not_stop_the_others_and_is_no_success(
     suite = tmp_path / "failing.toml"
     # HVAE needs a differentiable simulator, which this task has not.
     suite.write_text(
-        'title = "Failing"\nquestion = "Does it fail?"\npreset = "smoke"\n'
-        'repetitions = 1\n[[cells]]\ntasks = ["sir"]\nmethods = ["HVAE", "prior"]\n'
-        "n_calibration = [10]\n"
+        'preset = "smoke"\nrepetitions = 1\n[[cells]]\ntasks = ["sir"]\n'
+        'methods = ["HVAE", "prior"]\nn_calibration = [10]\n'
     )
     command = ["run", str(suite), "--out", str(tmp_path / "out")]
     for more, counts in (
@@ -206,21 +196,22 @@ def test_a_failing_method_does_not_stop_the_others_and_is_no_success(
         printed = capsys.readouterr().out
         assert counts in printed
         assert "failed: sir HVAE n_c=10 #0: " in printed
+    rows = Results(tmp_path / "out" / "failing").rows
+    assert {*rows["git_commit"]} == {code_version()}
     assert main([*command, "--method", "prior"]) == 0
 
 
 def test_methods_see_the_same_data_and_repetitions_do_not(tmp_path: Path) -> None:
     cell = Cell(task="linear_gaussian", preset="smoke", method="NPE", n_calibration=10)
-    cases = [
-        Case.of(other, Sources(), tmp_path, "cpu")
-        for other in (
+    first, same, other, shifted = (
+        Case(one, Workplace(tmp_path))
+        for one in (
             cell,
             replace(cell, method="RoPE", gamma=0.1, tau=1.0),
             replace(cell, repetition=1),
             replace(cell, variant="prior_shift"),
         )
-    ]
-    first, same, other, shifted = cases
+    )
     for name in ("simulations", "calibration", "test_set"):
         ours, theirs, others = (
             torch.cat([part.flatten() for part in getattr(case, name)])
@@ -231,34 +222,58 @@ def test_methods_see_the_same_data_and_repetitions_do_not(tmp_path: Path) -> Non
     # A variant of the real process has the same simulations, and shares the NPE.
     assert torch.equal(first.simulations[1], shifted.simulations[1])
     assert not torch.equal(first.test_set[1], shifted.test_set[1])
-    assert first.npe is not None
-    assert shifted.npe is not None
-    assert len(list(tmp_path.glob("npe-*"))) == 1
+    theta, x = first.test_set
+    ours, theirs = (
+        case.npe.log_prob_batched(theta[None], x) for case in (first, shifted)
+    )
+    assert torch.equal(ours, theirs)
+    assert len(list((tmp_path / "cache").glob("npe-*.pt"))) == 1
 
 
-def smoke_case(task: str, folder: Path) -> Case:
-    cell = Cell(task=task, preset="smoke", method="NPE", n_calibration=10)
-    return Case.of(cell, Sources(), folder, "cpu")
+class Thief:
+    """Runs code when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.write_text, (self.path, "code was run")
+
+
+def test_reading_what_cells_share_runs_no_code(tmp_path: Path) -> None:
+    assert smoke_case("linear_gaussian", tmp_path).npe is not None
+    for path in (tmp_path / "cache").glob("*.pt"):
+        kept = path.read_bytes()
+        torch.save(Thief(tmp_path / "proof"), path)
+        with pytest.raises(Exception, match=r"could run anything|Weights only load"):
+            _ = smoke_case("linear_gaussian", tmp_path).npe
+        path.write_bytes(kept)
+    assert not (tmp_path / "proof").exists()
+
+
+def smoke_case(task: str, folder: Path, **fields: Any) -> Case:
+    fields = {"method": "NPE", "n_calibration": 10} | fields
+    return Case(Cell(task=task, preset="smoke", **fields), Workplace(folder))
 
 
 def test_entries_say_which_methods_see_calibration_pairs_and_observations(
     tmp_path: Path,
 ) -> None:
-    case = smoke_case("linear_gaussian", tmp_path)
+    case = smoke_case("pendulum", tmp_path)
     for name, entry in METHODS.items():
-        if entry.build and case.task.name in (entry.tasks or (case.task.name,)):
-            sees = entry.build(case).sees
-            assert ("calibration" in sees) == entry.pairs, name
-            assert ("observations" in sees) == entry.observations, name
+        if entry.couples or name in STACKS:
+            assert entry.build is None
+            continue
+        assert entry.build is not None
+        sees = entry.build(case).sees
+        assert ("calibration" in sees) == entry.pairs, name
+        assert ("observations" in sees) == entry.observations, name
 
 
 def test_the_row_of_ot_only_is_that_of_the_method_of_its_name(tmp_path: Path) -> None:
-    case = smoke_case("linear_gaussian", tmp_path)
-    cell = replace(
-        case.cell, method="OT-only", gamma=0.1, tau=1.0, cost_scale="simulated"
-    )
-    (score,) = scores(replace(case, cell=cell), [cell])
-    assert isinstance(score, Score)
+    coupling = {"gamma": 0.1, "tau": 1.0, "cost_scale": "simulated"}
+    case = smoke_case("linear_gaussian", tmp_path, method="OT-only", **coupling)
+    (result,) = score(case, [case.cell])
     method = OTOnly.from_posterior(
         case.npe,
         simulator=case.simulator,
@@ -269,7 +284,7 @@ def test_the_row_of_ot_only_is_that_of_the_method_of_its_name(tmp_path: Path) ->
     ours = method.build_posterior().log_prob_batched(
         case.test_set[0][None], case.test_set[1]
     )
-    assert torch.equal(ours[0], score.evaluation.log_prob)
+    assert np.array_equal(ours[0].numpy(), result.arrays["log_probs"])
 
 
 @pytest.mark.slow

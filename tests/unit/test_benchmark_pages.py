@@ -9,17 +9,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks.cells import Cell, load_suite
+from benchmarks.cells import Cell
 from benchmarks.figures import draw_overview
 from benchmarks.pages import BLOCK, BLOCKS, pages_with_blocks, write_pages
-from benchmarks.published import (
-    FIXED,
-    PAPER,
-    Published,
-    against_candidates,
-    relative_ranks,
-)
+from benchmarks.published import FIXED, PAPER, Published, relative_ranks
 from benchmarks.store import Result, Results
+from benchmarks.suites import load_suite
 from tests.results import result_of
 
 pytestmark = pytest.mark.usefixtures("rough_pictures")
@@ -79,8 +74,7 @@ def test_only_places_that_are_whole_and_known_are_written(tmp_path: Path) -> Non
     results = published(tmp_path, on("cs", [{}]))
     page = tmp_path / "page.md"
     begin, end = "<!-- results: costs -->\n", "<!-- /results -->\n"
-    unknown = "<!-- results: unheard-of -->\n" + end
-    for text in (begin + begin + end, begin + end + end, unknown):
+    for text in (begin + begin + end, begin.replace("costs", "unheard-of") + end):
         page.write_text(text)
         with pytest.raises(SystemExit, match=r"page\.md: expected places"):
             write_pages(results, [page])
@@ -121,20 +115,19 @@ def test_methods_that_see_more_or_are_ours_are_counted_apart(tmp_path: Path) -> 
 
 
 def test_a_stack_is_compared_with_its_best_candidate(tmp_path: Path) -> None:
-    row, _ = result_of(Cell(task="pendulum", method="stack", n_calibration=10), -1.2)
-    arrays = {
-        "candidates": np.array(["prior", "NPE", "RoPE", "stack"]),
-        "test": np.array([-3.0, -9.0, -1.5]),
-        "held_out": np.array([-3.1, -8.0, -1.0, -1.7]),
-        "held_out_error": np.array([0.0, 0.0, 0.0, 0.2]),
-    }
-    results = Results(tmp_path / "stacking")
-    results.add([Result(row, arrays)])
-    (found,) = against_candidates(results).to_dict("records")
-    gaps = {"size": 10, "best": 0.3, "basics": 1.8, "held_out": 2.5}
-    assert found == pytest.approx(gaps)
+    cell = Cell(task="pendulum", method="stack", n_calibration=10)
+    scores = {"best_candidate": -1.15, "best_basic": -3.0}
+    row, _ = result_of(cell, -1.2)
+    far = {"held_out": -1.7, "held_out_error": 0.2}
+    near = {"held_out": -1.5, "held_out_error": 0.2, "best_candidate": -1.0}
+    Results(tmp_path / "stacking").add(
+        [
+            Result(row | scores | far, {}),
+            Result(row | scores | near | {"repetition": 1}, {}),
+        ]
+    )
     counts = line(BLOCKS["candidates"](Published.read(tmp_path)), "10")
-    assert counts == ["1", "1", "1", "0"]
+    assert counts == ["2", "1", "2", "1"]
 
 
 @pytest.mark.medium
@@ -157,21 +150,20 @@ def test_ranks_are_relative_to_what_was_run_and_a_failure_is_the_last() -> None:
 
 @pytest.mark.medium
 def test_the_pictures_of_all_tasks_are_drawn(tmp_path: Path) -> None:
-    draw_overview(published(tmp_path, on("cs", [{"stack": -1.0}])), tmp_path)
-    assert {path.name for path in tmp_path.glob("*.png")} == {
-        "methods.png",
-        "ranks.png",
-    }
+    draw_overview(published(tmp_path, on("cs", [{"stack": -1.0}])))
+    drawn = {path.name for path in tmp_path.glob("*.png")}
+    assert drawn == {"methods.png", "ranks.png"}
 
 
 @pytest.mark.medium
 def test_the_best_has_all_repetitions_and_the_fixed_setting(tmp_path: Path) -> None:
     usual = {"NPE": -1.0, "SBI": 0.0, "RoPE": -2.0, "RoPE, other": -0.5}
-    first = usual | {"MLP": -0.1, "prior": -math.inf}
+    first = usual | {"MLP": -0.1, "prior": -math.inf, "NNPE": None}
     runs = [first, usual | {"MLP": -0.1}, usual | {"MLP": "failed"}]
     lines = BLOCKS["lpp"](published(tmp_path, on("cs", runs)))
     assert line(lines, "NPE") == ["**-1.00 ± 0.00**"]
     assert line(lines, "MLP") == ["-0.10 ± 0.00 (1 of 3 failed)"]
+    assert line(lines, "NNPE") == ["-5.00 ± 0.00 [2]"]
     assert line(lines, "prior") == ["-inf"]
     assert line(lines, "RoPE") == ["-2.00 ± 0.00"]
     assert line(lines, f"RoPE ({PAPER})") == ["-0.50 ± 0.00"]
@@ -193,27 +185,9 @@ def test_readme_shows_scores_with_their_intervals(tmp_path: Path) -> None:
     assert line(lines, fmcpe)[0] == "-6.00 ± 0.00 (2; 1 failed)"
 
 
-@pytest.mark.medium
-def test_excerpts_say_what_failed_and_what_was_not_run(tmp_path: Path) -> None:
-    def scores(cell: Cell) -> float | str | None:
-        if cell.task != "cs" or cell.method not in ("NPE", "stack"):
-            return None
-        if cell.n_calibration == 50 and cell.repetition == 2:
-            return "failed"
-        if cell.n_calibration == 10 and cell.repetition:
-            return None
-        return -1.5 - cell.repetition
-
-    lines = BLOCKS["stack-and-others"](published(tmp_path, scores))
-    assert lines[0] == "|  | cs |"  # without the tasks that were not run
-    assert line(lines, "NPE") == ["-2.50"]
-    assert line(lines, "stack") == ["-1.50 [1] / -2.00 (1 of 3 failed) / -2.50"]
-    assert line(lines, "RoPE") == ["-"]
-
-
 def test_what_was_run_is_counted(tmp_path: Path) -> None:
     lines = BLOCKS["what-was-run"](published(tmp_path, on("cs", [{"MLP": "failed"}])))
-    finished, failed, missing = line(lines, "[main](main/report.md)")
+    finished, failed, missing = line(lines, "[main](main/n_calibration.png)")
     assert failed == "4: MLP 4"
     assert " ocean_colour " in missing
     total = len(load_suite("main").cells)

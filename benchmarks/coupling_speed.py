@@ -6,8 +6,8 @@ shipped. Seconds are the smallest of several repetitions, in which the solvers o
 problem take turns; compare within a problem. The error is the marginal error of the
 potential, by one function in float64 for all.
 
-    python -m benchmarks.experiments.coupling
-    python -m benchmarks.experiments.coupling --n 5000 --repeats 2
+    python -m benchmarks.coupling_speed
+    python -m benchmarks.coupling_speed --n 5000 --repeats 2
 """
 
 import argparse
@@ -15,7 +15,7 @@ import itertools
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -23,15 +23,10 @@ import ot
 import torch
 from torch import Tensor
 
-from benchmarks.experiments.common import Row, begin, show
 from sbi_rope import SinkhornCoupler
 from sbi_rope.coupling.sinkhorn import marginal_error
 
 SETTINGS = [(0.5, 0.9), (0.5, 1.0), (0.05, 0.9), (0.05, 1.0)]
-OPTIONS = {
-    "--n": {"type": int, "nargs": "+", "default": [500, 2000]},
-    "--repeats": {"type": int, "default": 5},
-}
 # Returns the iterations and the marginal error.
 Solver = Callable[[Tensor, Tensor], tuple[int, float]]
 
@@ -105,13 +100,13 @@ def error_of(potential: Any, points: tuple[Tensor, Tensor], setting: Any) -> flo
     return marginal_error(rows.logsumexp(dim=0) - math.log(len(rows)), w, tau)
 
 
-def rows(args: argparse.Namespace) -> Iterator[Row]:
+def rows(sizes: Sequence[int], repeats: int) -> Iterator[dict[str, object]]:
     """Yield a row for each problem and solver."""
     try:
         import jax
     except ImportError:
         jax = None
-    for n, setting in itertools.product(args.n, SETTINGS):
+    for n, setting in itertools.product(sizes, SETTINGS):
         points = embeddings(n)
         solvers: dict[str, Any] = {"own": partial(own, *setting)}
         solvers["POT (numpy)"] = partial(pot, *setting)
@@ -120,7 +115,7 @@ def rows(args: argparse.Namespace) -> Iterator[Row]:
             solvers["OTT-JAX"](*points)  # compilation is not measured
         seconds = dict.fromkeys(solvers, math.inf)
         found: dict[str, tuple[int, Any]] = {}
-        for _, name in itertools.product(range(args.repeats), solvers):
+        for _, name in itertools.product(range(repeats), solvers):
             start = time.perf_counter()
             found[name] = solvers[name](*points)
             seconds[name] = min(seconds[name], time.perf_counter() - start)
@@ -134,5 +129,23 @@ def rows(args: argparse.Namespace) -> Iterator[Row]:
             }
 
 
+def main() -> None:
+    """Print a table in Markdown, each row when it is there."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--n", type=int, nargs="+", default=[500, 2000])
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--threads", type=int, default=1)
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    versions = ", ".join(f"{one.__name__} {one.__version__}" for one in (torch, ot))
+    print(f"{args.threads} thread(s), {versions}\n")
+    for number, row in enumerate(rows(args.n, args.repeats)):
+        if number == 0:
+            print(f"| {' | '.join(row)} |\n{'|---' * len(row)}|")
+        print(f"| {' | '.join(map(str, row.values()))} |", flush=True)
+
+
 if __name__ == "__main__":
-    show(rows(begin(__doc__, OPTIONS, threads=1)))
+    main()

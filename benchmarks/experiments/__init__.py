@@ -1,4 +1,0 @@
-"""Experiments behind single choices and timings in the documentation.
-
-Each is run as ``python -m benchmarks.experiments.NAME`` and prints a table in Markdown.
-"""
