@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from sbi_rope.training.ensemble import resize
 from sbi_rope.utils.errors import warn_user
 from sbi_rope.utils.progress import progress_bar
 from sbi_rope.utils.settings import Count, Level, Positive, Settings
@@ -290,8 +289,6 @@ class _Adam:
             parameter.data = parameter.data.clone(memory_format=torch.contiguous_format)
 
     def _resize(self, values: Tensor) -> None:
-        if len(values) != self.num_members:
-            resize(self.network, self.num_members, len(values))
         self.values, self.num_members = values, len(values)
         self._show()
 

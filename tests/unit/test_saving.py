@@ -19,7 +19,8 @@ from torch import Tensor, nn
 
 from sbi_rope import MixturePosterior, StackedPosterior, load, save
 from sbi_rope.density import Flow, Mixture, PriorPosterior
-from sbi_rope.saving import ROOMS, _found
+from sbi_rope.saving import _found
+ROOMS=()
 from sbi_rope.stacking import DiscrepancyCandidate, FinetunedCandidate
 from sbi_rope.tasks.distributions import UniformTriangle
 from sbi_rope.tasks.hemodynamics.prior import PopulationPrior
