@@ -194,7 +194,8 @@ class Ensemble(nn.Module):
                 raise ValueError("Expected members that differ in parameters only.")
         self.num_members = len(members)
         self.net = _stacked(members)
-        if len(members) > 1 and not _keeps_rows(members[0], question, example):
+        is_one = len(members) == 1 or not list(self.parameters())
+        if not is_one and not _keeps_rows(members[0], question, example):
             self.net = _Loop(members)
         self.eval()
 
@@ -254,18 +255,15 @@ def _stacked(members: Sequence[nn.Module]) -> Any:
     def replaced(module: Any, others: Sequence[Any]) -> nn.Module:
         if id(others[0]) in done:
             return done[id(others[0])]
-        kind = STACKED.get(type(module))
-        own = [*module.parameters(recurse=False)]
-        if kind is not None and own[0].ndim > 2:  # zuko's stacks of linear layers
-            kind = None
-        if kind is not None or own:
-            done[id(others[0])] = (kind or _Loop)(others)
+        if own := list(module.parameters(recurse=False)):
+            kind = STACKED.get(type(module), _Loop)
+            # zuko has stacks of linear layers, too.
+            done[id(others[0])] = (_Loop if own[0].ndim > 2 else kind)(others)
             return done[id(others[0])]
         for name, child in module._modules.items():
             if child is not None:
-                module._modules[name] = replaced(
-                    child, [other._modules[name] for other in others]
-                )
+                of_each = [other._modules[name] for other in others]
+                module._modules[name] = replaced(child, of_each)
         return module
 
     return replaced(copy.deepcopy(members[0]), members)
@@ -276,18 +274,15 @@ def _keeps_rows(
     member: nn.Module, question: Question, example: Sequence[Tensor]
 ) -> bool:
     """Tell whether two members answer in one network as each does alone."""
-    other = copy.deepcopy(member).eval()
+    first, other = copy.deepcopy(member).eval(), copy.deepcopy(member).eval()
     with seeded(0):
         for parameter in other.parameters():
             scale = parameter.abs().mean() + 0.01
             parameter.add_(0.1 * scale * torch.randn_like(parameter))
-    first = copy.deepcopy(member).eval()
     alone = torch.cat([question(net, *example) for net in (first, other)])
+    rows = [torch.cat([part, part]) for part in example]
     try:
-        together = _stacked([first, other]).eval()
-        if isinstance(together, _Loop):
-            return True
-        rows = [torch.cat([part, part]) for part in example]
-        return torch.allclose(question(together, *rows), alone, rtol=1e-3, atol=1e-3)
-    except (RuntimeError, ValueError, TypeError):
+        found = question(_stacked([first, other]).eval(), *rows)
+        return torch.allclose(found, alone, rtol=1e-3, atol=1e-3)
+    except (RuntimeError, ValueError, TypeError, AttributeError):
         return False
