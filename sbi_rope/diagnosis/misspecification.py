@@ -11,7 +11,6 @@ from sbi_rope.coupling import Coupling
 from sbi_rope.diagnosis.report import UNLIKE_PAIRS, Finding
 from sbi_rope.diagnosis.simulations import Simulations, nearest_distances
 from sbi_rope.metrics.statistics import LEVEL, TwoSampleTest
-from sbi_rope.npe.sbi import squared_mmd
 from sbi_rope.npe.standardisation import FAR, deviations
 
 # The most observations and simulations in one MMD, whose cost is quadratic.
@@ -71,6 +70,14 @@ def mmd_test(batch: Tensor, simulated: Tensor, *, null: Tensor) -> MMDTest:
     # The batch itself counts as one of the draws, so that p is never 0.
     p_value = (1 + int((usual >= value).sum())) / (1 + NUM_DRAWS)
     return MMDTest(value, float(usual.median()), p_value)
+
+
+def squared_mmd(a: Tensor, b: Tensor) -> float:
+    """Return the squared MMD of two sets, Gaussian, of the median width."""
+    scale = 2 * torch.cdist(a, b).median().square()
+    pairs = (torch.cdist(*both).square() for both in ((a, a), (b, b), (a, b)))
+    within_a, within_b, across = (torch.exp(-far / scale).mean() for far in pairs)
+    return float(within_a + within_b - 2 * across)
 
 
 def before_tuning(test: MMDTest, *, tuned: bool) -> Finding:

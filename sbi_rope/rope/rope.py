@@ -37,7 +37,6 @@ from sbi_rope.utils.seeds import seeded
 from sbi_rope.utils.settings import Count, check
 from sbi_rope.utils.tensors import (
     as_numbers,
-    check_same_length,
     column_names,
     rows_with,
 )
@@ -254,8 +253,7 @@ class RoPE:
         weight = given_weights(weights, len(label), self._npe.like.device)
         of_rows = given_groups(groups, len(label))
         x_names = self.x_names or column_names(x)
-        x = self._npe.as_x("x", x)
-        check_same_length(label.y, x)
+        x = self._npe.as_x("x", x, rows=len(label))
         if self._npe.is_mixed and not label.are_exact:
             raise UnsupportedPosteriorError(
                 "Expected exact labels, because some parameters are discrete (MNPE); "

@@ -7,23 +7,17 @@ import pytest
 import torch
 from sbi.inference import (
     NPE,
-    DirectPosterior,
     EnsemblePosterior,
     MCMCPosterior,
 )
 from sbi.inference.posteriors import NPE_A_Posterior
 from sbi.inference.posteriors.filtered_direct_posterior import FilteredDirectPosterior
-from sbi.neural_nets import likelihood_nn
-from sbi.utils import RestrictedPrior, get_density_thresholder
 from torch import nn
-from torch.distributions import Categorical, MixtureSameFamily, MultivariateNormal
 
 from sbi_rope import RoPE
 from sbi_rope.npe.sbi import (
     embed,
     embedding_of,
-    estimator_of,
-    gaussians_of,
     headless,
     with_embedding,
 )
@@ -54,25 +48,6 @@ def test_what_has_no_amortised_estimator_is_refused_by_name() -> None:
         match = rf"NPE\(\.\.\.\)\.build_.*got {type(posterior).__name__}"
         with pytest.raises(UnsupportedPosteriorError, match=match):
             RoPE(posterior, simulator=problems.simulate)
-
-
-def restricted(accepts: Any) -> DirectPosterior:
-    """A posterior whose prior is restricted to a part of a box."""
-    posterior = copy.deepcopy(problems.npe_posterior())
-    posterior.prior = RestrictedPrior(problems.box(2), accepts)
-    return posterior
-
-
-def test_the_posterior_of_truncated_sequential_npe_is_refused() -> None:
-    # As in sbi's tutorial of TSNPE.
-    near_x_o = problems.npe_posterior()
-    near_x_o = copy.deepcopy(near_x_o).set_default_x(torch.zeros(3))
-    accepts = get_density_thresholder(near_x_o, num_samples_to_estimate_support=100)
-    with pytest.raises(UnsupportedPosteriorError, match=r"\(TSNPE\)"):
-        RoPE(restricted(accepts), simulator=problems.simulate)
-    # A prior without the parameters whose simulations fail is none around an x.
-    posterior = restricted(lambda theta: theta[:, 0] > 0)
-    assert estimator_of(posterior) is posterior.posterior_estimator
 
 
 def test_npe_without_a_prior_is_asked_for_it() -> None:
@@ -112,19 +87,3 @@ def test_embed_does_not_depend_on_the_batch() -> None:
     assert torch.allclose(embed(net, x, batch_size=3), whole, atol=1e-6)
     assert torch.allclose(embed(net, x[4:5]), whole[4:5], atol=1e-6)
     assert not whole.requires_grad
-
-
-def test_the_gaussians_of_a_mixture_density_network_have_its_density() -> None:
-    torch.manual_seed(0)
-    theta, x = torch.randn(50, 2), torch.randn(50, 3)
-    network = likelihood_nn("mdn", z_score_x="none", num_components=3)(theta, x)
-    for parameter in network.parameters():
-        torch.nn.init.normal_(parameter, std=0.2)
-    logits, means, covariances = gaussians_of(network, theta)
-    correlated = covariances - torch.diag_embed(covariances.diagonal(dim1=-2, dim2=-1))
-    assert correlated.abs().mean() > 0.1
-    law = MixtureSameFamily(
-        Categorical(logits=logits), MultivariateNormal(means, covariances)
-    )
-    expected = network.log_prob(x[None], theta)[0].double()
-    torch.testing.assert_close(law.log_prob(x), expected, atol=0.02, rtol=0.01)
