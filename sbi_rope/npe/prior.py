@@ -2,7 +2,7 @@
 
 import copy
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from sbi.utils.user_input_checks_utils import move_distribution_to_device
@@ -28,6 +28,8 @@ class PriorDistribution(Distribution):
         prior: A torch distribution, or what sbi's ``process_prior`` returns.
     """
 
+    arg_constraints: ClassVar[dict[str, Any]] = {}
+
     def __init__(self, prior: Any) -> None:
         own = prior._own if isinstance(prior, PriorDistribution) else prior
         self._own = copy.deepcopy(own)
@@ -46,11 +48,6 @@ class PriorDistribution(Distribution):
 
     def __repr__(self) -> str:
         return repr(self._own)
-
-    @property
-    def arg_constraints(self) -> dict[str, Any]:
-        """There are none."""
-        return {}
 
     def to(self, device: Any) -> None:
         """Move the prior to a device."""
@@ -164,11 +161,9 @@ def check_in_support(
     name: str, theta: Tensor, prior: Any, *, rows: Tensor | None = None
 ) -> None:
     """Raise if a row of ``theta``, or one of those ``rows``, has no prior density."""
-    if rows is None:
-        rows = torch.ones(len(theta), dtype=torch.bool, device=theta.device)
-    outside = torch.zeros_like(rows)
-    if rows.any():
-        outside[rows] = ~PriorDistribution(prior).inside(theta[rows])
+    outside = ~PriorDistribution(prior).inside(theta)
+    if rows is not None:
+        outside &= rows
     if outside.any():
         raise InvalidInputError(
             f"Expected `{name}` inside the support of the prior; got "

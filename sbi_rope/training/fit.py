@@ -124,7 +124,8 @@ def fit(
         loss: Of a batch, the mean loss of each member, ``(E,)``, or of the module.
             Members that have stopped are not in the batch and in the network any more.
         training: Learning rate and so on; ``batches`` has the size of the batches.
-        validation_loss: The loss over the hold-out set, of the batch ``held_out``.
+        validation_loss: The loss over the hold-out set, if there is one.
+        held_out: The batch that ``validation_loss`` is called with.
         courses: Whether ``max_num_epochs`` are a course that others may follow, after
             which the validation loss is computed.
         learning_rates: One for each member; that of ``training`` if None.
@@ -132,6 +133,7 @@ def fit(
         in_training_mode: Whether dropout and batch statistics are active in training.
         decay: Whether the step size falls to zero, along a cosine over all epochs.
         label: What the progress bar and warnings call it.
+        show_progress_bars: Whether to show the course of the loss.
     """
     if not any(parameter.requires_grad for parameter in network.parameters()):
         network.requires_grad_()
@@ -165,7 +167,7 @@ def fit(
     for epoch in progress:
         state = [optimiser.values, *buffers]
         is_over = courses is None or epoch in (0, start + length)
-        better = going & (validation_loss is None)
+        better, gain = going & (validation_loss is None), best_loss[members]
         if validation_loss is not None and is_over:
             with torch.no_grad():
                 score = validation_loss(*of_members(held_out)).detach()

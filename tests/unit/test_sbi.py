@@ -5,22 +5,13 @@ from typing import Any
 
 import pytest
 import torch
-from sbi.inference import (
-    NPE,
-    EnsemblePosterior,
-    MCMCPosterior,
-)
+from sbi.inference import NPE, EnsemblePosterior, MCMCPosterior
 from sbi.inference.posteriors import NPE_A_Posterior
 from sbi.inference.posteriors.filtered_direct_posterior import FilteredDirectPosterior
 from torch import nn
 
 from sbi_rope import RoPE
-from sbi_rope.npe.sbi import (
-    embed,
-    embedding_of,
-    headless,
-    with_embedding,
-)
+from sbi_rope.npe.sbi import embed, embedding_of, headless, with_embedding
 from sbi_rope.utils.errors import UnsupportedPosteriorError
 from tests import problems
 
