@@ -28,7 +28,7 @@ class PriorDistribution(Distribution):
         prior: A torch distribution, or what sbi's ``process_prior`` returns.
     """
 
-    arg_constraints: ClassVar[dict[str, Any]] = {}
+    arg_constraints: ClassVar[dict[str, Any]] = {}  # type: ignore[override]
 
     def __init__(self, prior: Any) -> None:
         own = prior._own if isinstance(prior, PriorDistribution) else prior

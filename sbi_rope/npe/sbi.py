@@ -366,16 +366,12 @@ def _built(kind: type, estimator: Any, prior: Distribution, **options: Any) -> A
 class BaseDirectPosterior(DirectPosterior):
     """sbi's DirectPosterior, for our own posteriors to derive from.
 
-    Shallow copies share no state. Observations are checked by :meth:`_one_x`: sbi
-    itself refuses any NaN, which some embedding nets can read.
+    Shallow copies share no state. They check observations in ``_one_x``: sbi itself
+    refuses any NaN, which some embedding nets can read.
     """
 
-    def _one_x(self, x: Any) -> Tensor:
-        """Return a checked observation; the default x if it is None."""
-        raise NotImplementedError
-
     def _x_else_default_x(self, x: Any) -> Tensor:
-        return self._one_x(x)
+        return self._one_x(x)  # type: ignore[attr-defined]
 
     def _keep_default_x(self, x: Tensor) -> None:
         """Set the default x to a copy of an observation that was checked."""

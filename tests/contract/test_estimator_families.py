@@ -5,12 +5,19 @@ import functools
 import pickle
 import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Any
 
 import pytest
 import torch
-from sbi.inference import MNPE, DirectPosterior
+from sbi.inference import (
+    MNPE,
+    NPE,
+    DirectPosterior,
+    EnsemblePosterior,
+    MCMCPosterior,
+)
+from sbi.inference.posteriors import NPE_A_Posterior
+from sbi.inference.posteriors.filtered_direct_posterior import FilteredDirectPosterior
 from sbi.neural_nets import factory, posterior_nn
 from sbi.utils import within_support
 from torch import Tensor, nn
@@ -28,7 +35,11 @@ from sbi_rope.npe.sbi import (
     with_embedding,
 )
 from sbi_rope.rope.finetuning import trainable_copy
-from sbi_rope.utils.errors import InvalidInputError, LogProbUnavailableError
+from sbi_rope.utils.errors import (
+    InvalidInputError,
+    LogProbUnavailableError,
+    UnsupportedPosteriorError,
+)
 from tests import problems
 
 QUIET = {"show_progress_bars": False}
@@ -86,7 +97,7 @@ def with_cases(
 
 
 def test_every_name_of_sbi_is_among_the_cases_or_refused() -> None:
-    refused = {"tabpfn"}  # its posterior is filtered, see tests/unit/test_sbi.py
+    refused = {"tabpfn"}  # its posterior is filtered, see below
     tested = {family for family, *_ in CASES}
     assert set(factory.model_builders) == tested | refused
 
@@ -140,21 +151,43 @@ def test_a_tuned_embedding_in_its_place_changes_the_density_accordingly(
         assert (swapped - estimator.log_prob(theta, x)).abs().max() > 1e-3
 
 
-@dataclass(frozen=True)
-class Repaired:
-    """A posterior repaired by RoPE, with what it was made of."""
+def test_with_embedding_shares_all_other_parameters() -> None:
+    estimator = problems.npe_posterior("maf").posterior_estimator
+    old = {id(p) for p in embedding_of(estimator).parameters()}
+    density = {id(p) for p in estimator.parameters()} - old
+    swapped = with_embedding(estimator, nn.Identity())
+    assert {id(p) for p in swapped.parameters()} == density
 
-    npe: Any
-    before: dict[str, Tensor]
-    rope: RoPE
-    posterior: MixturePosterior
+
+@pytest.mark.parametrize("family", ["mdn", "made", "maf", "zuko_nsf", "mnpe"])
+def test_what_was_made_headless_can_be_given_an_embedding(family: str) -> None:
+    estimator = problems.npe_posterior(family).posterior_estimator
+    theta = problems.npe_posterior(family).prior.sample((5,))[None]
+    x = torch.randn(5, 3)
+    whole = with_embedding(
+        headless(estimator), embedding_of(estimator), condition_shape=(3,)
+    )
+    assert whole.condition_shape == (3,)
+    assert torch.equal(whole.log_prob(theta, x), estimator.log_prob(theta, x))
+    assert headless(whole).condition_shape == (4,)
+
+
+def test_embed_does_not_depend_on_the_batch() -> None:
+    net = nn.Sequential(nn.Linear(3, 4), nn.BatchNorm1d(4), nn.Dropout(0.5)).train()
+    x = torch.randn(10, 3)
+    whole = embed(net, x)
+    assert torch.allclose(embed(net, x, batch_size=3), whole, atol=1e-6)
+    assert torch.allclose(embed(net, x[4:5]), whole[4:5], atol=1e-6)
+    assert not whole.requires_grad
+
+
+# --- repaired posteriors ---
 
 
 @functools.cache
-def repaired(family: str, embedding: str = "linear", dim: int = 2) -> Repaired:
+def repaired(family: str, embedding: str, dim: int) -> tuple[RoPE, MixturePosterior]:
     """Repair a posterior of the family once a session; for reading only."""
     npe = problems.npe_posterior(family, embedding, "independent", dim)
-    before = copy.deepcopy(npe.posterior_estimator.state_dict())
     simulate = problems.simulate_image if embedding == "cnn" else problems.simulate
     with torch.random.fork_rng():
         torch.manual_seed(2)
@@ -163,11 +196,11 @@ def repaired(family: str, embedding: str = "linear", dim: int = 2) -> Repaired:
         finetuner = CalibrationFinetuner(max_num_epochs=3)
         rope = RoPE(npe, simulator=simulate, finetuner=finetuner)
         rope.append_calibration(theta[:10], x[:10]).train(seed=0, **QUIET)
-        posterior = rope.build_posterior(x[10:], num_simulations=8, seed=0)
-    return Repaired(npe, before, rope, posterior)
+        return rope, rope.build_posterior(x[10:], num_simulations=8, seed=0)
 
 
-REPAIRED = pytest.mark.parametrize(
+@pytest.mark.medium
+@pytest.mark.parametrize(
     ("family", "embedding", "dim"),
     [
         *[(family, "linear", 2) for family in problems.FAMILIES],
@@ -178,70 +211,51 @@ REPAIRED = pytest.mark.parametrize(
         ("mnpe", "none", 1),
     ],
 )
-
-
-@pytest.mark.medium
-@REPAIRED
 def test_rope_makes_of_posteriors_of_the_family_others_that_can_be_pickled(
     family: str, embedding: str, dim: int
 ) -> None:
-    case = repaired(family, embedding, dim)
-    posterior, x_o = case.posterior, case.posterior.x_o
+    npe = problems.npe_posterior(family, embedding, "independent", dim)
+    before = copy.deepcopy(npe.posterior_estimator.state_dict())
+    rope, posterior = repaired(family, embedding, dim)
+    x_o, unnormalised = posterior.x_o, {"norm_posterior": False}
     samples = posterior.sample_batched((3,), x_o, **QUIET)
     assert samples.shape == (3, 20, *posterior.posterior_estimator.input_shape)
-    assert within_support(case.npe.prior, samples).all()
+    assert within_support(npe.prior, samples).all()
 
-    log_prob = posterior.log_prob_batched(samples, x_o, norm_posterior=False)
+    log_prob = posterior.log_prob_batched(samples, x_o, **unnormalised)
     assert log_prob.shape == (3, 20)
     assert torch.isfinite(log_prob).all()
-    one = posterior.log_prob(samples[:, 4], x=x_o[4], norm_posterior=False)
+    one = posterior.log_prob(samples[:, 4], x=x_o[4], **unnormalised)
     assert torch.allclose(one, log_prob[:, 4], atol=1e-4)
     # Parameters of other observations, far in the tails of most components.
-    other = case.npe.prior.sample((20,))
-    log_prob_of_other = posterior.log_prob_batched(other, x_o, norm_posterior=False)
+    other = npe.prior.sample((20,))
+    log_prob_of_other = posterior.log_prob_batched(other, x_o, **unnormalised)
     assert not log_prob_of_other.isnan().any()
-
-    # The posterior that was repaired is left as it was, and shares nothing.
-    after = case.npe.posterior_estimator
-    assert after.state_dict().keys() == case.before.keys()
-    assert all(torch.equal(v, case.before[k]) for k, v in after.state_dict().items())
-    assert all(p.requires_grad for p in after.parameters())
-    ours = {id(p) for p in posterior.posterior_estimator.parameters()}
-    assert not ours & {id(p) for p in after.parameters()}
-
     copied = pickle.loads(pickle.dumps(posterior))
-    assert torch.equal(
-        copied.log_prob_batched(other, x_o, norm_posterior=False), log_prob_of_other
-    )
-
+    found = copied.log_prob_batched(other, x_o, **unnormalised)
+    assert torch.equal(found, log_prob_of_other)
     # Of other families, thousands of draws for the mass inside the prior take seconds.
     if family not in SLOW:
         normalised = posterior.log_prob_batched(samples, x_o)
         assert (normalised >= log_prob - 1e-5).all()
 
-
-@pytest.mark.parametrize(
-    ("family", "embedding", "dim"),
-    [
-        ("mdn", "linear", 2),
-        ("maf", "cnn", 2),
-        ("zuko_nsf", "linear", 2),
-        ("mnpe", "none", 1),
-    ],
-)
-def test_the_tuned_posterior_of_the_family_is_the_flow_on_the_tuned_embedding(
-    family: str, embedding: str, dim: int
-) -> None:
-    case = repaired(family, embedding, dim)
-    tuned, x_o = case.rope.tuned_posterior(), case.posterior.x_o
+    # The tuned posterior is the flow on the tuned embedding.
+    tuned, g, h = rope.tuned_posterior(), rope.tuned_embedding_net, rope.embedding_net
     assert type(tuned) is DirectPosterior
-    theta = case.npe.prior.sample((20,))
-    g, h = case.rope.tuned_embedding_net, case.rope.embedding_net
     assert not torch.equal(embed(g, x_o), embed(h, x_o))
-    q = headless(case.npe.posterior_estimator)
-    expected = q.log_prob(theta[None], embed(g, x_o))
-    log_prob = tuned.log_prob_batched(theta, x_o, norm_posterior=False)
-    assert torch.allclose(log_prob, expected, atol=1e-4)
+    q = headless(npe.posterior_estimator)
+    expected = q.log_prob(other[None], embed(g, x_o))[0]
+    found = tuned.log_prob_batched(other, x_o, **unnormalised)[0]
+    usable = torch.isfinite(expected)
+    assert torch.allclose(found[usable], expected[usable], atol=1e-4)
+
+    # The posterior that was repaired is left as it was, and shares nothing.
+    after = npe.posterior_estimator
+    assert after.state_dict().keys() == before.keys()
+    assert all(torch.equal(v, before[k]) for k, v in after.state_dict().items())
+    assert all(p.requires_grad for p in after.parameters())
+    ours = {id(p) for p in posterior.posterior_estimator.parameters()}
+    assert not ours & {id(p) for p in after.parameters()}
 
 
 @pytest.mark.medium
@@ -258,7 +272,7 @@ def test_densities_of_the_family_integrate_to_one_inside_the_prior(
     # The mass inside the prior is estimated from draws. Usually there are 1024, which
     # is an error of up to 0.03 here.
     monkeypatch.setattr("sbi_rope.density.base.NUM_DRAWS", 8192)
-    posterior = repaired(family, dim=1).posterior[0]
+    posterior = repaired(family, "linear", 1)[1][0]
     edges = torch.linspace(-1, 1, 101)
     theta = (edges[1:] + edges[:-1])[:, None] / 2
     density = posterior.log_prob(theta).exp()
@@ -304,6 +318,34 @@ def test_the_samples_of_a_vector_field_are_those_of_sbi(method: str) -> None:
         (2,), x, show_progress_bars=False, reject_outside_prior=False
     )
     assert torch.allclose(samples, expected, atol=1e-4)
+
+
+# --- refusals ---
+
+
+def test_what_has_no_amortised_estimator_is_refused_by_name() -> None:
+    for posterior in (
+        # Without state, which is enough for a check that looks at the type.
+        MCMCPosterior.__new__(MCMCPosterior),
+        NPE_A_Posterior.__new__(NPE_A_Posterior),
+        FilteredDirectPosterior.__new__(FilteredDirectPosterior),
+        EnsemblePosterior([problems.npe_posterior()] * 2),
+        problems.gaussian_posterior(),
+        NPE(problems.box(2), show_progress_bars=False),
+        problems.npe_posterior().posterior_estimator,
+    ):
+        match = rf"NPE\(\.\.\.\)\.build_.*got {type(posterior).__name__}"
+        with pytest.raises(UnsupportedPosteriorError, match=match):
+            RoPE(posterior, simulator=problems.simulate)
+
+
+def test_npe_without_a_prior_is_asked_for_it() -> None:
+    theta = problems.box(2).sample((50,))
+    npe = NPE(density_estimator="mdn", show_progress_bars=False)
+    npe.append_simulations(theta, problems.simulate(theta)).train(max_num_epochs=1)
+    with pytest.raises(UnsupportedPosteriorError, match=r"build_posterior\(prior="):
+        RoPE(npe.build_posterior(), simulator=problems.simulate)
+    RoPE(npe.build_posterior(prior=problems.box(2)), simulator=problems.simulate)
 
 
 # --- discrete parameters ---
