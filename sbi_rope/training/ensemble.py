@@ -73,6 +73,9 @@ class _Stacked(nn.Module):
             path, _, leaf = name.rpartition(".")
             owner: Any = clone.get_submodule(path)
             owner._parameters[leaf] = value
+        for part in clone.modules():
+            if isinstance(part, nn.RNNBase):  # has a list of its parameters, too
+                part._init_flat_weights()
         return clone
 
 
