@@ -194,7 +194,9 @@ def check_rows_apart(net: nn.Module, x: Tensor) -> None:
     except Exception:  # the net may take no such numbers
         return
     usable = torch.isfinite(together) & torch.isfinite(alone)
-    size = together.where(usable, 0.0).abs().max()
+    if not usable.any():
+        return
+    size = together[usable].abs().max()
     if bool(((together - alone).abs()[usable] > ROUNDING * size).any()):
         raise UnsupportedPosteriorError(
             "Expected an embedding net that reads each observation by itself; got "
