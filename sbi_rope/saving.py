@@ -1,72 +1,43 @@
 """Posteriors in files that are loaded without running code from the file.
 
-Torch reads the file with ``weights_only=True``, which allows only what is listed:
-classes that derive from one of our bases and are defined in one of a few packages, and
-a few functions of tensors. None of these imports by name, evaluates text, opens a file
-or unpickles. In the place of a class, torch finds what makes empty objects only, except
-for distributions and transforms, which zuko calls.
+Torch reads the file with ``weights_only=True`` and makes only what is on a list. Ours
+has the networks, distributions and posteriors of a few packages, the dataclasses of
+this one, and some functions of tensors. None of these imports by name, evaluates text,
+opens a file or unpickles.
 """
 
 import functools
 import importlib
 import pickle
-import zipfile
 from collections.abc import Sequence
 from dataclasses import is_dataclass
 from importlib.metadata import version
 from pathlib import Path
-from types import FunctionType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import sbi
 import torch
+from sbi.inference import DirectPosterior, VectorFieldPosterior
 from torch import Tensor, nn
 from torch.distributions import Distribution, Transform
 from torch.distributions.constraints import Constraint
 from torch.serialization import get_unsafe_globals_in_checkpoint, safe_globals
 
-from sbi_rope.npe.sbi import BasePotential, NeuralPosterior
+from sbi_rope.npe.sbi import BasePotential
 from sbi_rope.utils.errors import DataNotFoundError, FileFormatError
 from sbi_rope.utils.files import write_atomically
 from sbi_rope.utils.settings import check
 
-LAWS = (Distribution, Transform)
-BASES = (nn.Module, *LAWS, Constraint, NeuralPosterior, BasePotential)
 # Other posteriors of sbi run more code when they are loaded.
-ROOMS = (
-    *("torch.nn.modules.", "torch.distributions.", "zuko."),
-    *("nflows.distributions.", "nflows.flows.", "nflows.nn.", "nflows.transforms."),
-    "sbi.inference.posteriors.direct_posterior.",
-    "sbi.inference.posteriors.npe_a_posterior.",
-    "sbi.inference.posteriors.vector_field_posterior.",
-    *("sbi.inference.potentials.", "sbi.neural_nets.", "sbi.samplers.ode_solvers."),
-    *("sbi.utils.", "sbi_rope."),
-)
-# Dataclasses of these rooms are results. Others call what they hold, or run programs.
-RESULTS = (
-    *("sbi_rope.metrics.statistics.", "sbi_rope.baselines.", "sbi_rope.coupling."),
-    *("sbi_rope.data.pairs.Counts", "sbi_rope.density.sets.SetScores"),
-    *("sbi_rope.discrepancy.", "sbi_rope.metrics.", "sbi_rope.stacking."),
-    "sbi_rope.tasks.hemodynamics.prior_table.",
-)
-# Functions of zuko that make transforms, and a class of nflows that holds tensors.
-OTHERS = (
-    "zuko.flows.polynomial.ShiftedSOSPTransform",
-    "zuko.flows.spline.CircularRQSTransform",
-    "nflows.transforms.linear.LinearCache",
-)
-ACTIVATIONS = (
-    *("celu", "elu", "hardswish", "hardtanh", "leaky_relu", "mish", "relu", "relu6"),
-    *("selu", "silu", "softmax", "softsign", "tanhshrink"),
-)
-# Pickle finds these as attributes: functions of torch, and methods of vector fields.
-# Some other methods write files.
+Posterior = DirectPosterior | VectorFieldPosterior
+BASES = (nn.Module, Distribution, Transform, Constraint, Posterior, BasePotential)
+PACKAGES = ("sbi.", "sbi_rope.", "torch.distributions.", "torch.nn.modules.")
+# All that these define works on tensors only.
+OF_TENSORS = ("nflows.", "torch._C._nn.", "torch.nn.functional.", "zuko.")
+# Functions that pickle finds as attributes of torch, where there are others.
 OF_TORCH = ("exp", "relu", "selu", "sigmoid", "sin", "tanh")
-METHODS = (
-    *("ode_fn", "_f_condition_last", "_identity_weight_fn"),
-    *("_max_likelihood_weight_fn", "_variance_weight_fn"),
-)
 
 
 def save(posterior: Any, path: str | Path, *, overwrite: bool = False) -> None:
@@ -91,12 +62,12 @@ def save(posterior: Any, path: str | Path, *, overwrite: bool = False) -> None:
         >>> again.sample((5,)).shape
         torch.Size([5, 2])
     """
-    check("posterior", posterior, NeuralPosterior)
+    check("posterior", posterior, Posterior)
     path = Path(path).expanduser()
     if path.exists() and not overwrite:
         raise FileExistsError(f"{path} exists. Pass overwrite=True to replace it.")
-    content = {"versions": _versions(), "posterior": posterior}
     pickler = SimpleNamespace(__name__="pickle", Pickler=_Pickler)
+    content = {"versions": _versions(), "posterior": posterior}
     with write_atomically(path) as temporary:
         torch.save(content, temporary, pickle_module=pickler)
 
@@ -120,16 +91,20 @@ def load(path: str | Path, *, trusted: Sequence[Any] = ()) -> Any:
     path = Path(path).expanduser()
     if not path.is_file():
         raise DataNotFoundError(f"Expected a file at {path}; got none.")
-    for one in trusted:
-        check("trusted", one, type | FunctionType)
-    # What was defined in a notebook or script may have moved to a module since.
-    known = {f"__main__.{one.__qualname__}": one for one in trusted}
-    known |= {f"{one.__module__}.{one.__qualname__}": one for one in trusted}
+    own = {f"{one.__module__}.{one.__qualname__}": one for one in trusted}
     try:
-        content = _content(path, known)
+        names = get_unsafe_globals_in_checkpoint(path)
+        found = {name: own.get(name) or _found(name) for name in names}
+        if unknown := sorted(name for name in names if found[name] is None):
+            classes = ", ".join(name.rpartition(".")[2] for name in unknown)
+            raise FileFormatError(
+                f"{path} needs {', '.join(unknown)}, which could run anything. If you "
+                f"trust its author, import it and pass `trusted=[{classes}]`."
+            )
+        with safe_globals([(value, name) for name, value in found.items()]):
+            content = torch.load(path, map_location="cpu", weights_only=True)
         posterior, versions = content["posterior"], content["versions"]
-        if not isinstance(posterior, NeuralPosterior):
-            raise TypeError("it holds no posterior")
+        check("posterior", posterior, Posterior)
     except FileFormatError:
         raise
     except Exception as error:  # a damaged file may lead to any
@@ -143,30 +118,8 @@ def load(path: str | Path, *, trusted: Sequence[Any] = ()) -> Any:
             "versions, or build the posterior and save it again."
         )
     if torch.device(posterior.potential_fn.device).type != "cpu":
-        posterior.to("cpu")  # type: ignore[attr-defined]
+        posterior.to("cpu")
     return posterior
-
-
-def _content(path: Path, known: dict[str, Any]) -> Any:
-    with zipfile.ZipFile(path) as archive:
-        if archive.testzip() is not None:  # torch does not compare check sums
-            raise ValueError("a check sum is wrong")
-    names = get_unsafe_globals_in_checkpoint(path)
-    needed = {name: known.get(name) or _found(name) for name in names}
-    if unknown := sorted(name for name in names if needed[name] is None):
-        classes = ", ".join(name.rpartition(".")[2] for name in unknown)
-        raise FileFormatError(
-            f"{path} needs {', '.join(unknown)}, which could run anything. If you "
-            f"trust its author, import it and pass `trusted=[{classes}]`."
-        )
-    allowed: list[Any] = []
-    for name, value in needed.items():
-        is_called = name in known or _may_be_called(value)
-        allowed.append((value if is_called else _Maker(value), name))
-        # Torch fills objects only if their class is listed. No file can name this.
-        allowed.append((value, f"{name}\n"))
-    with safe_globals(allowed):
-        return torch.load(path, map_location="cpu", weights_only=True)
 
 
 class _Pickler(pickle.Pickler):
@@ -186,16 +139,12 @@ def _attribute(owner: Any, name: str) -> Any:
     """Stand for ``getattr``, which would find any attribute."""
     if owner == "torch" and name in OF_TORCH:
         return getattr(torch, name)
-    if isinstance(owner, nn.Module) and name in METHODS:
-        return getattr(owner, name)
+    if type(owner).__module__.startswith("sbi.") and isinstance(owner, nn.Module):
+        return getattr(owner, name)  # vector fields hold methods of their own
     raise FileFormatError(f"A file must not ask for the attribute {name!r}.")
 
 
 LISTED = {
-    **{f"torch.nn.functional.{k}": getattr(nn.functional, k) for k in ACTIVATIONS},
-    "torch._C._nn.gelu": nn.functional.gelu,
-    "torch._C._nn.log_sigmoid": nn.functional.logsigmoid,
-    "torch._C._nn.softplus": nn.functional.softplus,
     "torch._C._VariableFunctionsClass": "torch",
     "functools.partial": functools.partial,
     "builtins.range": range,
@@ -206,7 +155,7 @@ LISTED = {
 
 def _found(name: str) -> Any:
     """Return what a file may name without being trusted; None if it is not known."""
-    if name in LISTED or not name.startswith(ROOMS):
+    if name in LISTED or not name.startswith((*PACKAGES, *OF_TENSORS)):
         return LISTED.get(name)
     module, _, attribute = name.rpartition(".")
     try:
@@ -215,25 +164,11 @@ def _found(name: str) -> Any:
         return None
     if getattr(found, "__module__", None) != module:
         return None  # a module may use what is harmful, but not define it
-    if name in OTHERS:
-        return found
-    is_result = name.startswith(RESULTS) and is_dataclass(found)
-    is_known = isinstance(found, type) and (is_result or issubclass(found, BASES))
+    is_known = name.startswith(OF_TENSORS)
+    if isinstance(found, type):
+        is_result = name.startswith("sbi_rope.") and is_dataclass(found)
+        is_known |= is_result or issubclass(found, BASES)
     return found if is_known else None
-
-
-def _may_be_called(value: Any) -> bool:
-    if not isinstance(value, type) or value in LISTED.values():
-        return True
-    return issubclass(value, LAWS) and value.__module__.startswith(("torch.", "zuko."))
-
-
-class _Maker:
-    """Makes empty objects of a class, and cannot be called as its constructor can."""
-
-    def __init__(self, kind: type) -> None:
-        # Torch calls what it takes for the `__new__` of a class.
-        vars(self)["__new__"] = lambda _: object.__new__(kind)
 
 
 def _versions() -> dict[str, str]:

@@ -23,7 +23,7 @@ from sbi_rope.baselines.statistics import (
 from sbi_rope.data.pairs import split_pairs
 from sbi_rope.methods.base import Method
 from sbi_rope.methods.training import EstimatorBuilder
-from sbi_rope.npe.sbi import embed, gaussians_of, posterior_from
+from sbi_rope.npe.sbi import embed, posterior_from
 from sbi_rope.npe.standardisation import Standardisation
 from sbi_rope.training.fit import History, Training
 from sbi_rope.utils.seeds import seeded
@@ -32,6 +32,8 @@ from sbi_rope.utils.tensors import as_batch
 
 # K, the share of the draws that come from the prior, and lambda.
 NUM_DRAWS, SHARE_OF_PRIOR, SHRINKAGE = 32, 0.25, 0.1
+# What sbi adds to the precision of each Gaussian that it mixes.
+SMALLEST_PRECISION = 1e-4
 # Units of each of the two hidden layers, as in the original code.
 HIDDEN = 128
 # Gaussians that the density of simulated statistics mixes.
@@ -316,3 +318,19 @@ def log_likelihood(
         validate_args=False,
     )
     return law.log_prob(y.double()), of_mean
+
+
+def gaussians_of(network: Any, condition: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the Gaussians that a mixture density network of sbi mixes.
+
+    Given conditions ``(n, k)``, these are the logarithms of their weights up to a
+    constant, ``(n, c)``, their means, ``(n, c, l)``, and covariances, ``(n, c, l, l)``,
+    all in float64. The network was built with ``z_score_x="none"``.
+    """
+    mixture = network.get_uncorrected_mog(condition)
+    # In float32 a narrow covariance would not be positive definite after rounding.
+    factors = mixture.precision_factors.double()
+    identity = torch.eye(factors.shape[-1]).to(factors)
+    precision = factors.mT @ factors + SMALLEST_PRECISION * identity
+    covariances = torch.cholesky_inverse(torch.linalg.cholesky(precision))
+    return mixture.logits.double(), mixture.means.double(), covariances

@@ -58,13 +58,10 @@ def mmd_test(batch: Tensor, simulated: Tensor, null: Tensor) -> tuple[float, flo
 
 def _squared_mmd(a: Tensor, b: Tensor) -> float:
     """Return the squared MMD of two sets, Gaussian, of the median width."""
-    across = torch.cdist(a, b)
-    scale = -0.5 / across.median().square()
-    aa, ab, bb = (
-        (distance.square() * scale).exp().mean()
-        for distance in (torch.cdist(a, a), across, torch.cdist(b, b))
-    )
-    return float(aa + bb - 2 * ab)
+    scale = 2 * torch.cdist(a, b).median().square()
+    pairs = (torch.cdist(*both).square() for both in ((a, a), (b, b), (a, b)))
+    within_a, within_b, across = (torch.exp(-far / scale).mean() for far in pairs)
+    return float(within_a + within_b - 2 * across)
 
 
 def before_tuning(test: tuple[float, float], *, tuned: bool) -> Finding:

@@ -2,7 +2,7 @@
 
 import copy
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from sbi.utils.user_input_checks_utils import move_distribution_to_device
@@ -28,6 +28,8 @@ class PriorDistribution(Distribution):
         prior: A torch distribution, or what sbi's ``process_prior`` returns.
     """
 
+    arg_constraints: ClassVar[dict[str, Any]] = {}  # type: ignore[override]
+
     def __init__(self, prior: Any) -> None:
         own = prior._own if isinstance(prior, PriorDistribution) else prior
         self._own = copy.deepcopy(own)
@@ -46,11 +48,6 @@ class PriorDistribution(Distribution):
 
     def __repr__(self) -> str:
         return repr(self._own)
-
-    @property
-    def arg_constraints(self) -> dict[str, Any]:
-        """There are none."""
-        return {}
 
     def to(self, device: Any) -> None:
         """Move the prior to a device."""
@@ -100,12 +97,9 @@ class PriorDistribution(Distribution):
 
     @cached_property
     def is_unbounded(self) -> bool:
-        """Whether the support is the whole space."""
-        if _base_of(self._support) not in (constraints.real, constraints.real_vector):
-            return False
+        """Whether parameters far outside all draws have a density, too."""
         with seeded(0):
             draws = self.sample((NUM_DRAWS,))
-        # sbi says so of every prior that states no bounds.
         apart = draws + FAR_APART * (draws - draws.mean(dim=0))
         return bool(self.inside(apart).all())
 
@@ -118,7 +112,8 @@ class PriorDistribution(Distribution):
 
     def bounds(self, like: Tensor) -> tuple[Tensor, Tensor]:
         """Return the ends of the support, like ``like``; infinite where not known."""
-        return _bounds(self._support, like)
+        low = _entries(self._support, like, "lower_bound", -torch.inf)
+        return low, _entries(self._support, like, "upper_bound", torch.inf)
 
     def off_bounds(self, theta: Tensor) -> Tensor:
         """Return theta ``(n, d)``, those on a bound moved to the next number inside.
@@ -127,7 +122,8 @@ class PriorDistribution(Distribution):
         """
         low, high = self.bounds(theta)
         inside = theta.clamp(low.nextafter(high), high.nextafter(low))
-        return theta.where(_is_discrete(self._support, theta), inside)
+        is_discrete = _entries(self._support, theta, "is_discrete", 0.0) > 0
+        return theta.where(is_discrete, inside)
 
     # --- units ---
 
@@ -165,11 +161,9 @@ def check_in_support(
     name: str, theta: Tensor, prior: Any, *, rows: Tensor | None = None
 ) -> None:
     """Raise if a row of ``theta``, or one of those ``rows``, has no prior density."""
-    if rows is None:
-        rows = torch.ones(len(theta), dtype=torch.bool, device=theta.device)
-    outside = torch.zeros_like(rows)
-    if rows.any():
-        outside[rows] = ~PriorDistribution(prior).inside(theta[rows])
+    outside = ~PriorDistribution(prior).inside(theta)
+    if rows is not None:
+        outside &= rows
     if outside.any():
         raise InvalidInputError(
             f"Expected `{name}` inside the support of the prior; got "
@@ -178,32 +172,13 @@ def check_in_support(
         )
 
 
-def _base_of(support: Any) -> Any:
+def _entries(support: Any, like: Tensor, name: str, default: float) -> Tensor:
+    """Return a property of the support of each parameter, like ``like``."""
     while isinstance(support, constraints.independent):
         support = support.base_constraint
-    return support
-
-
-def _is_discrete(support: Any, like: Tensor) -> Tensor:
-    support = _base_of(support)
     if isinstance(support, constraints.cat):  # of sbi's MultipleIndependent
-        columns = like.split(support.lengths, dim=-1)
-        parts = [_is_discrete(*one) for one in zip(support.cseq, columns, strict=True)]
-        return torch.cat(parts, dim=-1)
-    is_discrete = bool(getattr(support, "is_discrete", False))
-    return torch.full_like(like, is_discrete, dtype=torch.bool)
-
-
-def _bounds(support: Any, like: Tensor) -> tuple[Tensor, Tensor]:
-    support = _base_of(support)
-    if isinstance(support, constraints.cat):
-        columns = like.split(support.lengths, dim=-1)
-        ends = [_bounds(*one) for one in zip(support.cseq, columns, strict=True)]
-        low, high = (torch.cat(some, dim=-1) for some in zip(*ends, strict=True))
-        return low, high
-    unknown = (0.0, 1.0) if support is constraints.boolean else (-torch.inf, torch.inf)
-    low, high = (
-        torch.as_tensor(getattr(support, name, end)).to(like).expand_as(like)
-        for name, end in zip(("lower_bound", "upper_bound"), unknown, strict=True)
-    )
-    return low, high
+        columns = zip(support.cseq, like.split(support.lengths, dim=-1), strict=True)
+        return torch.cat([_entries(*one, name, default) for one in columns], dim=-1)
+    if support is constraints.boolean:
+        support = constraints.integer_interval(0, 1)
+    return torch.as_tensor(getattr(support, name, default)).to(like).expand_as(like)

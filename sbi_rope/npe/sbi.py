@@ -26,10 +26,6 @@ from sbi.neural_nets.estimators.base import (
     UnconditionalDensityEstimator as UnconditionalDensityEstimator,
 )
 from sbi.neural_nets.estimators.mixed_density_estimator import MixedDensityEstimator
-from sbi.neural_nets.estimators.mixture_density_estimator import (
-    MixtureDensityEstimator,
-)
-from sbi.neural_nets.estimators.tabpfn_flow import TabPFNFlow
 from sbi.neural_nets.net_builders.flow import (
     build_zuko_unconditional_flow as build_zuko_unconditional_flow,
 )
@@ -54,8 +50,6 @@ ROUNDING = 0.01
 # An entry does not vary if its standard deviation is less than this share of its mean,
 # or what sbi divides it by then.
 CONSTANT, SMALLEST_STD = 1e-6, 1e-7
-# What sbi adds to the precision of each Gaussian that it mixes.
-SMALLEST_PRECISION = 1e-4
 
 
 # --- an estimator, split into h and q ---
@@ -67,16 +61,10 @@ def embedding_of(estimator: ConditionalEstimator) -> nn.Module:
     It includes sbi's standardising layer. Without a user-given network it is that
     layer alone; with ``z_score_x="none"`` as well it is the identity.
     """
-    if isinstance(estimator, MixedDensityEstimator):
-        embedding = estimator.condition_embedding
-        if estimator.discrete_net.net.embedding_net is not embedding:
-            raise UnsupportedPosteriorError(
-                "Expected a MixedDensityEstimator whose two parts share one embedding "
-                "net; got two. Use `posterior_nn('mnpe', embedding_net=...)`."
-            )
-        return embedding
-    embedding: Any = getattr(estimator, "embedding_net", None)
-    if isinstance(estimator, TabPFNFlow) or not _paths_to(estimator, embedding):
+    is_mixed = isinstance(estimator, MixedDensityEstimator)
+    name = "condition_embedding" if is_mixed else "embedding_net"
+    embedding: Any = getattr(estimator, name, None)
+    if not _paths_to(estimator, embedding):
         raise UnsupportedPosteriorError(
             "Expected an estimator of sbi's posterior_nn with a trained embedding net; "
             f"got {type(estimator).__name__}."
@@ -86,15 +74,9 @@ def embedding_of(estimator: ConditionalEstimator) -> nn.Module:
 
 def headless(estimator: ConditionalEstimator) -> Any:
     r"""Return :math:`q(\theta \mid h)`, which shares the parameters of an estimator."""
-    embedding = embedding_of(estimator)
     blank = parameter_of(estimator).new_zeros(1, *estimator.condition_shape)
-    embedded_shape = embed(embedding, blank).shape[1:]
-    if len(embedded_shape) != 1:
-        raise UnsupportedPosteriorError(
-            "Expected the embedding net to return one vector per observation, shape "
-            f"(n, l); got {('n', *embedded_shape)}."
-        )
-    clone = with_embedding(estimator, nn.Identity(), condition_shape=embedded_shape)
+    shape = embed(embedding_of(estimator), blank).shape[1:]
+    clone = with_embedding(estimator, nn.Identity(), condition_shape=shape)
     return MixedDensity(clone) if isinstance(clone, MixedDensityEstimator) else clone
 
 
@@ -109,30 +91,41 @@ def with_embedding(
     The other parameters are shared with ``estimator``, which is left as it was. The
     ``condition_shape`` is that of what the new net embeds; as before if None.
     """
-    clone: nn.Module = estimator
-    paths = _paths_to(estimator, embedding_of(estimator))
-    for path in paths:
-        clone = _replace(clone, path.split("."), embedding)
-    for path in paths if condition_shape is not None else []:
-        names = path.split(".")
-        for depth in range(len(names)):
-            module = clone.get_submodule(".".join(names[:depth]))
-            if isinstance(module, ConditionalEstimator):
-                module._condition_shape = torch.Size(condition_shape or ())
+    clone: Any = estimator
+    for path in _paths_to(estimator, embedding_of(estimator)):
+        clone = _replaced(clone, path.split("."), embedding, condition_shape)
+    return clone
+
+
+def _paths_to(root: nn.Module, target: nn.Module) -> list[str]:
+    named = root.named_modules(remove_duplicate=False)
+    return [name for name, module in named if module is target and name]
+
+
+def _replaced(
+    root: Any, path: list[str], new: nn.Module, shape: Sequence[int] | None
+) -> nn.Module:
+    """Put a module at the end of a path, along which modules are copied."""
+    if not path:
+        return new
+    clone = copy.copy(root)  # without its tensors
+    clone._modules = dict(root._modules)
+    clone._modules[path[0]] = _replaced(root._modules[path[0]], path[1:], new, shape)
+    if shape is not None and isinstance(clone, ConditionalEstimator):
+        clone._condition_shape = torch.Size(shape)
     return clone
 
 
 def embed(net: nn.Module, x: Tensor, *, batch_size: int = 1000) -> Tensor:
     """Apply a net in evaluation mode, in batches, without gradients, to ``(n, l)``."""
-    modes = {module: module.training for module in net.modules()}
-    net.eval()
+    was_training = net.training
     try:
         with torch.no_grad():
+            net.eval()
             # A net may change its argument, as activations in place do.
             return torch.cat([net(part.clone()) for part in x.split(batch_size)])
     finally:
-        for module, training in modes.items():
-            module.training = training
+        net.train(was_training)
 
 
 def standardisation_of(embedding_net: nn.Module) -> tuple[Tensor, Tensor] | None:
@@ -165,23 +158,6 @@ def parameter_of(module: nn.Module) -> Tensor:
     return next(p for p in module.parameters() if p.is_floating_point())
 
 
-def _paths_to(root: nn.Module, target: nn.Module) -> list[str]:
-    named = root.named_modules(remove_duplicate=False)
-    return [name for name, module in named if module is target and name]
-
-
-def _replace(root: nn.Module, path: list[str], new: nn.Module) -> nn.Module:
-    # Only the modules along the path are copied, and those without their tensors.
-    clone = copy.copy(root)
-    clone._modules = dict(root._modules)
-    child = root._modules[path[0]]
-    if len(path) > 1:
-        assert child is not None
-        new = _replace(child, path[1:], new)
-    clone._modules[path[0]] = new
-    return clone
-
-
 def readable(net: nn.Module, x: Tensor) -> Tensor:
     """Tell which observations an embedding net can read, ``(n, *event)`` to ``(n,)``.
 
@@ -189,43 +165,42 @@ def readable(net: nn.Module, x: Tensor) -> Tensor:
     (NaN), such as sbi's ``PermutationInvariantEmbedding``; none reads Inf, or NaN only.
     """
     rows = x.flatten(1)
-    finite, missing = torch.isfinite(rows), torch.isnan(rows)
+    finite = torch.isfinite(rows)
     can_read = finite.all(dim=1)
-    partial = finite.any(dim=1) & missing.any(dim=1) & (finite | missing).all(dim=1)
-    if partial.any():
-        try:
-            embedded = embed(net, x[partial])
-        except Exception:  # nets refuse NaN with errors of any kind
-            return can_read
-        can_read[partial] = torch.isfinite(embedded).flatten(1).all(dim=1)
-        some = x[partial & can_read][:2]
-        full = some.nan_to_num(0.0)
-        sparse = full.clone()
-        if x.ndim > 2:
-            sparse[:, 1:] = torch.nan
-        # sbi 0.27 takes the number of trials from another row if trials have several
-        # columns. Sets with some, no and most trials missing stand side by side here.
-        check_rows_apart(net, torch.stack([some, full, sparse], dim=1).flatten(0, 1))
+    partial = ~can_read & finite.any(dim=1) & ~torch.isinf(rows).any(dim=1)
+    if not partial.any():
+        return can_read
+    try:
+        embedded = embed(net, x[partial])
+    except Exception:  # nets refuse NaN with errors of any kind
+        return can_read
+    can_read[partial] = torch.isfinite(embedded).flatten(1).all(dim=1)
+    some = x[partial & can_read][:2]
+    full = some.nan_to_num(0.0)
+    sparse = full.clone()
+    if x.ndim > 2:
+        sparse[:, 1:] = torch.nan
+    # sbi 0.27 takes the number of trials from another row if trials have several
+    # columns. Sets with some, no and most trials missing stand side by side here.
+    check_rows_apart(net, torch.stack([some, full, sparse], dim=1).flatten(0, 1))
     return can_read
 
 
 def check_rows_apart(net: nn.Module, x: Tensor) -> None:
     """Raise if the embedding of a row is another one alone than among other rows."""
     try:
-        with seeded(0):
-            together, again = embed(net, x), embed(net, x)
-            alone = torch.cat([embed(net, row) for row in x.split(1)])
+        together = embed(net, x)
+        alone = torch.cat([embed(net, row) for row in x.split(1)])
     except Exception:  # the net may take no such numbers
         return
     usable = torch.isfinite(together) & torch.isfinite(alone)
-    if not usable.any() or not torch.equal(together[usable], again[usable]):
-        return  # a net with noise of its own
-    margin = ROUNDING * together[usable].abs().max()
-    if bool(((together - alone).abs()[usable] > margin).any()):
-        missing = " with missing entries (NaN)" if x.isnan().any() else ""
+    if not usable.any():
+        return
+    size = together[usable].abs().max()
+    if bool(((together - alone).abs()[usable] > ROUNDING * size).any()):
         raise UnsupportedPosteriorError(
-            f"Expected an embedding net that reads each observation{missing} by "
-            "itself; got another embedding of a row alone than in a batch."
+            "Expected an embedding net that reads each observation by itself; got "
+            "another embedding of a row alone than in a batch."
         )
 
 
@@ -236,8 +211,7 @@ class MixedDensity(ConditionalDensityEstimator):
     """The mixed estimator of MNPE, as a density over all of the prior's support.
 
     It is zero at a category that was not trained on, which sbi gives the mass of the
-    next larger one or refuses, and with ``log_transform_x`` at zero and below, where
-    sbi returns NaN.
+    next larger one or refuses.
     """
 
     def __init__(self, estimator: MixedDensityEstimator) -> None:
@@ -252,27 +226,16 @@ class MixedDensity(ConditionalDensityEstimator):
     def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
         """Return the log of density times mass, ``(S, B)``."""
         categories = self.mixed.discrete_net.net.categorical_values_per_var
-        continuous = input[..., : -len(categories)]
+        count = len(categories)
         # Detached, so that gradient ascent does not move between categories.
-        discrete = input[..., -len(categories) :].detach()
-        trained = torch.stack(
-            [
-                torch.isin(column, values.to(column))
-                for column, values in zip(discrete.unbind(-1), categories, strict=True)
-            ],
-            dim=-1,
-        )
-        inside = torch.ones_like(continuous, dtype=torch.bool)
-        if self.mixed.log_transform_input:
-            inside = continuous > 0
-        # Anything that can be evaluated stands in for what cannot be.
+        discrete = input[..., -count:].detach()
+        columns = zip(discrete.unbind(-1), categories, strict=True)
+        trained = torch.stack([torch.isin(c, v.to(c)) for c, v in columns], dim=-1)
+        # Any category that can be evaluated stands in for what cannot be.
         some = torch.stack([values[0] for values in categories]).to(discrete)
-        valid = torch.cat(
-            [continuous.where(inside, 1.0), discrete.where(trained, some)], dim=-1
-        )
-        log_prob = self.mixed.log_prob(valid, condition)
-        possible = trained.all(dim=-1) & inside.all(dim=-1)
-        return log_prob.where(possible, -torch.inf)
+        valid = [input[..., :-count], discrete.where(trained, some)]
+        log_prob = self.mixed.log_prob(torch.cat(valid, dim=-1), condition)
+        return log_prob.where(trained.all(dim=-1), -torch.inf)
 
     def sample(
         self, sample_shape: torch.Size, condition: Tensor, **kwargs: Any
@@ -298,16 +261,15 @@ class VectorFieldDensity(ConditionalDensityEstimator):
         sample_with: Literal["ode", "sde"],
     ) -> None:
         super().__init__(estimator, estimator.input_shape, estimator.condition_shape)
-        self.vector_field = estimator
-        self.prior = prior
-        self.sample_with: Literal["ode", "sde"] = sample_with
+        self.vector_field, self.prior, self.sample_with = estimator, prior, sample_with
 
     def sample(
         self, sample_shape: torch.Size, condition: Tensor, **kwargs: Any
     ) -> Tensor:
         """Solve the ODE or SDE for every condition; no prior support is enforced."""
-        posterior = _vector_field_posterior(
-            self.vector_field, self.prior, sample_with=self.sample_with
+        options = {"sample_with": self.sample_with}
+        posterior = _built(
+            VectorFieldPosterior, self.vector_field, self.prior, **options
         )
         with warnings.catch_warnings():
             # Draws outside the prior are rejected by the mixture; the batch is ours.
@@ -331,24 +293,6 @@ class VectorFieldDensity(ConditionalDensityEstimator):
         return self.vector_field.loss(input, condition, **kwargs)
 
 
-def gaussians_of(
-    estimator: MixtureDensityEstimator, condition: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the Gaussians that a mixture density network mixes.
-
-    Given conditions ``(n, k)``, these are the logarithms of their weights up to a
-    constant, ``(n, c)``, their means, ``(n, c, l)``, and covariances, ``(n, c, l, l)``,
-    all in float64. The network was built with ``z_score_x="none"``.
-    """
-    mixture: Any = estimator.get_uncorrected_mog(condition)
-    # In float32 a narrow covariance would not be positive definite after rounding.
-    factors = mixture.precision_factors.double()
-    identity = torch.eye(factors.shape[-1]).to(factors)
-    precision = factors.mT @ factors + SMALLEST_PRECISION * identity
-    covariances = torch.cholesky_inverse(torch.linalg.cholesky(precision))
-    return mixture.logits.double(), mixture.means.double(), covariances
-
-
 # --- posteriors ---
 
 
@@ -359,13 +303,6 @@ def estimator_of(posterior: Any) -> ConditionalEstimator:
         raise UnsupportedPosteriorError(
             "Expected a posterior that knows its prior; got none. Use "
             "`npe.build_posterior(prior=prior)`."
-        )
-    # One that leaves out parameters whose simulations fail is no hindrance.
-    accepts = getattr(getattr(prior, "_accept_reject_fn", None), "__qualname__", "")
-    if accepts.startswith("get_density_thresholder."):
-        raise UnsupportedPosteriorError(
-            "Expected a posterior trained on the whole prior; got a prior truncated "
-            "around one observation (TSNPE)."
         )
     if isinstance(posterior, VectorFieldPosterior):
         return posterior.vector_field_estimator
@@ -397,32 +334,19 @@ def check_density(
 
 def is_bounded(posterior: DirectPosterior) -> bool:
     """Tell whether a posterior does without sbi's rejection, which may never end."""
-    # NPE_A_Posterior of sbi has a method of its own, but of the same kind.
-    return type(posterior).leakage_correction.__module__.split(".")[0] != "sbi"
+    return isinstance(posterior, BaseDirectPosterior)
 
 
 def posterior_from(
     posterior: Any, estimator: Any
 ) -> DirectPosterior | VectorFieldPosterior:
     """Return an sbi posterior of the same kind as ``posterior`` around an estimator."""
+    options = {"enable_transform": posterior.enable_transform}
     if isinstance(estimator, ConditionalDensityEstimator):
-        return direct_posterior(
-            estimator, posterior.prior, enable_transform=posterior.enable_transform
-        )
-    return _vector_field_posterior(
-        estimator,
-        copy.deepcopy(posterior.prior),
-        enable_transform=posterior.enable_transform,
-        sample_with=posterior.sample_with,
-    )
-
-
-def _vector_field_posterior(
-    estimator: Any, prior: Distribution, **options: Any
-) -> VectorFieldPosterior:
-    device = parameter_of(estimator).device
-    with seeded(0):  # sbi draws from the prior to look at it
-        return VectorFieldPosterior(estimator, prior, device=device, **options)
+        return direct_posterior(estimator, posterior.prior, **options)
+    options["sample_with"] = posterior.sample_with
+    prior = copy.deepcopy(posterior.prior)
+    return _built(VectorFieldPosterior, estimator, prior, **options)
 
 
 def direct_posterior(
@@ -432,29 +356,24 @@ def direct_posterior(
     enable_transform: bool = True,
 ) -> DirectPosterior:
     """Return an sbi posterior around an estimator and a copy of the prior."""
+    options = {"enable_transform": enable_transform}
+    return _built(DirectPosterior, estimator, copy.deepcopy(prior), **options)
+
+
+def _built(kind: type, estimator: Any, prior: Distribution, **options: Any) -> Any:
     with seeded(0):  # sbi draws from the prior to look at it
-        return DirectPosterior(
-            estimator,
-            copy.deepcopy(prior),
-            device=parameter_of(estimator).device,
-            enable_transform=enable_transform,
-        )
+        return kind(estimator, prior, device=parameter_of(estimator).device, **options)
 
 
 class BaseDirectPosterior(DirectPosterior):
     """sbi's DirectPosterior, for our own posteriors to derive from.
 
-    ``map()`` shows progress only if asked to, and never returns less than the best of
-    its starting points. Shallow copies share no state. Observations are checked by
-    :meth:`_one_x`: sbi itself refuses any NaN, which some embedding nets can read.
+    Shallow copies share no state. They check observations in ``_one_x``: sbi itself
+    refuses any NaN, which some embedding nets can read.
     """
 
-    def _one_x(self, x: Any) -> Tensor:
-        """Return a checked observation; the default x if it is None."""
-        return super()._x_else_default_x(x)
-
     def _x_else_default_x(self, x: Any) -> Tensor:
-        return self._one_x(x)
+        return self._one_x(x)  # type: ignore[attr-defined]
 
     def _keep_default_x(self, x: Tensor) -> None:
         """Set the default x to a copy of an observation that was checked."""
@@ -463,34 +382,6 @@ class BaseDirectPosterior(DirectPosterior):
     def __getstate__(self) -> dict[str, Any]:
         # sbi hands out its own __dict__, which a shallow copy would then share.
         return dict(self.__dict__)
-
-    def _calculate_map(  # type: ignore[override]
-        self,
-        *,
-        init_method: str | Tensor = "posterior",
-        num_init_samples: int,
-        show_progress_bars: bool,
-        **options: Any,
-    ) -> Tensor:
-        # sbi shows the progress of these draws whatever it was told.
-        if isinstance(init_method, str) and init_method == "posterior":
-            init_method = self.sample(
-                (num_init_samples,), show_progress_bars=show_progress_bars
-            )
-        found = super()._calculate_map(
-            init_method=init_method,
-            num_init_samples=num_init_samples,
-            show_progress_bars=show_progress_bars,
-            **options,
-        )
-        if not isinstance(init_method, Tensor):
-            return found
-        # Where no step improves on the best start, sbi transforms that start a second
-        # time and returns another point.
-        heights, found = self.potential_fn(init_method), found.reshape(1, -1)
-        if bool(self.potential_fn(found) >= heights.max()):
-            return found
-        return init_method[heights.argmax()].reshape(1, -1)
 
 
 class TrainedNPE:
@@ -501,6 +392,9 @@ class TrainedNPE:
         prior: The copy of the prior, with one set of shapes.
         h: The embedding net of the copy, with sbi's standardising layer.
         like: An empty tensor ``(0, d)`` with the dtype and device of the estimator.
+        event_shape: The shape of one observation.
+        is_mixed: Whether some parameters are discrete.
+        enable_transform: Whether sbi's ``map`` searches in an unbounded space.
         parameter_names: The names of the parameters; None if there are none.
         x_names: The names of the columns of tables of x; None if they are not known.
     """
@@ -508,35 +402,22 @@ class TrainedNPE:
     def __init__(self, posterior: Any, parameter_names: Any = None) -> None:
         estimator = copy.deepcopy(estimator_of(posterior)).eval()
         self.estimator = estimator.requires_grad_(requires_grad=False)
-        self.h = embedding_of(estimator)
-        self._q = headless(estimator)
+        self.h, self._q = embedding_of(estimator), headless(estimator)
         self._posterior: Any = posterior_from(posterior, estimator)
         self.prior = PriorDistribution(posterior.prior)
         self.like = parameter_of(estimator).new_empty(0, *estimator.input_shape)
+        self.event_shape: torch.Size = estimator.condition_shape
+        self.is_mixed = isinstance(self._q, MixedDensity)
+        self.enable_transform: bool = posterior.enable_transform
         self.parameter_names: tuple[str, ...] | None = None
         if parameter_names is not None:
             self.parameter_names = names_of(parameter_names, self.like.shape[1])
         self.x_names: tuple[str, ...] | None = None
-        generator = torch.Generator().manual_seed(0)
-        x = torch.randn(4, *self.event_shape, generator=generator).to(self.like)
+        with seeded(0):
+            x = torch.randn(4, *self.event_shape).to(self.like)
         mean, std = standardisation_of(self.h) or (0.0, 1.0)
         check_rows_apart(self.h, mean + std * x)
         leave_out_constants(self.h)
-
-    @property
-    def event_shape(self) -> torch.Size:
-        """The shape of one observation."""
-        return self.estimator.condition_shape
-
-    @property
-    def is_mixed(self) -> bool:
-        """Whether some parameters are discrete."""
-        return isinstance(self._q, MixedDensity)
-
-    @property
-    def enable_transform(self) -> bool:
-        """Whether sbi's ``map`` searches in an unbounded space."""
-        return self._posterior.enable_transform
 
     def posterior(self, embedding_net: nn.Module | None = None) -> Any:
         """Return a copy of the sbi posterior, with another net in the place of h."""
@@ -555,25 +436,13 @@ class TrainedNPE:
 
     def embed(self, name: str, x: Tensor, embedding_net: nn.Module) -> Tensor:
         """Return the finite embeddings of a user's observations, shape ``(n, l)``."""
-        embedded = embed(embedding_net, x)
-        bad = ~torch.isfinite(torch.linalg.vector_norm(embedded, dim=1))
-        if bad.any():
-            raise InvalidInputError(
-                f"Expected `{name}` with finite embeddings; got NaN, Inf or too large "
-                f"numbers in {rows_with(bad)}."
-            )
-        return embedded
+        return as_batch(f"embeddings of {name}", embed(embedding_net, x))
 
-    def as_x(self, name: str, x: Any) -> Tensor:
+    def as_x(self, name: str, x: Any, *, rows: int | None = None) -> Tensor:
         """Return a copy of a user's observations, if h can read them."""
-        x = as_batch(
-            name,
-            x,
-            self.event_shape,
-            device=self.like.device,
-            names=self.x_names,
-            finite=False,
-        ).to(self.like.dtype, copy=True)
+        options: dict[str, Any] = {"device": self.like.device, "names": self.x_names}
+        x = as_batch(name, x, self.event_shape, rows=rows, finite=False, **options)
+        x = x.to(self.like.dtype, copy=True)
         if not (can_read := self.readable(x)).all():
             raise InvalidInputError(
                 f"Expected `{name}` without NaN or Inf that the embedding net of NPE "

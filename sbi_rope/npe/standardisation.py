@@ -35,20 +35,15 @@ def warn_of_far_entries(name: str, x: Tensor, embedding_net: nn.Module) -> None:
         return
     mean, std = standardisation_of(embedding_net) or (x, x)
     ignored = torch.isinf(std) & ((x - mean).abs() > 1e-4 * mean.abs())
-    if ignored.any():
-        entries = ignored.any(dim=0).flatten().nonzero().flatten()
-        warn_user(
-            f"{len(entries)} of the {far[0].numel()} entries of `{name}` (first: "
-            f"{entries[:5].tolist()}) never vary in simulations, or by less than 1e-7, "
-            "and are ignored."
-        )
-    if (far > FAR).any():
-        entries = (far > FAR).any(dim=0).flatten().nonzero().flatten()
-        warn_user(
-            f"{len(entries)} of the {far[0].numel()} entries of `{name}` (first: "
-            f"{entries[:5].tolist()}) are up to {float(far.max()):.1g} standard "
-            "deviations away from simulations. Check the units."
-        )
+    never = "never vary in simulations, or by less than 1e-7, and are ignored"
+    away = f"up to {float(far.max()):.1g} standard deviations away from simulations"
+    for found, what in ((ignored, never), (far > FAR, f"are {away}. Check the units")):
+        if found.any():
+            entries = found.any(dim=0).flatten().nonzero().flatten()
+            warn_user(
+                f"{len(entries)} of the {far[0].numel()} entries of `{name}` (first: "
+                f"{entries[:5].tolist()}) {what}."
+            )
 
 
 class Standardisation(nn.Module):

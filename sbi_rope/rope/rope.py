@@ -31,7 +31,6 @@ from sbi_rope.utils.seeds import seeded
 from sbi_rope.utils.settings import Count, check
 from sbi_rope.utils.tensors import (
     as_numbers,
-    check_same_length,
     column_names,
     rows_with,
 )
@@ -239,8 +238,7 @@ class RoPE:
         weight = given_weights(weights, len(y), y.device)
         of_rows = given_groups(groups, len(y))
         x_names = self.x_names or column_names(x)
-        x = self._npe.as_x("x", x)
-        check_same_length(y, x)
+        x = self._npe.as_x("x", x, rows=len(y))
         rows = torch.arange(len(y), device=y.device)
         new = Pairs(theta=draws, x=x, group=rows, weight=weight, y=y, std=std)
         if self._npe.is_mixed and not new.are_exact:

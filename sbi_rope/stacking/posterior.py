@@ -11,7 +11,7 @@ from sbi_rope.density import Density, Flow, Mixture, MixturePosterior
 from sbi_rope.density.sets import SetScores
 from sbi_rope.stacking.report import StackingReport
 from sbi_rope.utils.errors import InvalidInputError
-from sbi_rope.utils.tensors import as_batch, check_same_length
+from sbi_rope.utils.tensors import as_batch
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,14 +148,14 @@ class StackedPosterior(MixturePosterior):
         Raises:
             InvalidInputError: If shapes do not fit.
         """
+        x = self._batch_of_x(x)
         theta = as_batch(
             "theta",
             theta,
             self.posterior_estimator.input_shape,
+            rows=len(x),
             names=self.parameter_names,
         )
-        x = self._batch_of_x(x)
-        check_same_length(theta, x)
         x = x.to(self.posterior_estimator.device)
         log_probs = [one.average.log_prob(theta[None], x)[0] for one in self.versions]
         return torch.stack(log_probs, dim=1).double()

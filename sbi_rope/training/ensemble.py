@@ -57,32 +57,37 @@ class _Stacked(nn.Module):
 
     def __init__(self, members: Sequence[nn.Module]) -> None:
         super().__init__()
-        self.num_members = len(members)
-        # In a list, so that its own parameters are not trained.
-        self._one = [copy.deepcopy(members[0]).requires_grad_(requires_grad=False)]
         self.names = [name for name, _ in members[0].named_parameters()]
-        each = [dict(member.named_parameters()) for member in members]
-        self.stacks = nn.ParameterList(
-            torch.stack([of_one[name].detach() for of_one in each])
-            for name in self.names
-        )
+        each = [[one.detach() for one in member.parameters()] for member in members]
+        self.stacks = nn.ParameterList(map(torch.stack, zip(*each, strict=True)))
+        # The rest of a member: buffers, settings and parts without parameters.
+        self.rest = copy.deepcopy(members[0])
+        for name in self.names:
+            path, _, leaf = name.rpartition(".")
+            self.rest.get_submodule(path)._parameters[leaf] = None
 
-    def member(self, number: int) -> nn.Module:
-        """Return the module of one member."""
-        one = copy.deepcopy(self._one[0])
-        with torch.no_grad():
-            for name, stack in zip(self.names, self.stacks, strict=True):
-                one.get_parameter(name).copy_(stack[number])
-        return one
+    def member(self, parameters: Sequence[Tensor]) -> nn.Module:
+        """Return a member with these parameters, which shares all else with others."""
+        clone = _shallow(self.rest)
+        for name, value in zip(self.names, parameters, strict=True):
+            path, _, leaf = name.rpartition(".")
+            owner: Any = clone.get_submodule(path)
+            owner._parameters[leaf] = value
+        for part in clone.modules():
+            if isinstance(part, nn.RNNBase):  # has a list of its parameters, too
+                part._init_flat_weights()
+        return clone
 
-    def train(self, mode: bool = True) -> Any:  # noqa: FBT001, FBT002
-        """Switch dropout and batch statistics of the members on or off."""
-        self._one[0].train(mode)
-        return super().train(mode)
 
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:  # noqa: FBT001, FBT002
-        self._one[0]._apply(fn)
-        return super()._apply(fn, recurse)
+def _shallow(module: nn.Module) -> nn.Module:
+    """Copy a module without its tensors."""
+    clone = copy.copy(module)
+    clone._parameters = dict(module._parameters)
+    clone._modules = {
+        name: None if child is None else _shallow(child)
+        for name, child in module._modules.items()
+    }
+    return clone
 
 
 class _Linear(_Stacked):
@@ -90,10 +95,10 @@ class _Linear(_Stacked):
 
     def forward(self, x: Tensor) -> Tensor:
         weight, *bias = self.stacks
-        mask = getattr(self._one[0], "mask", None)
+        mask = getattr(self.rest, "mask", None)
         if mask is not None:
             weight = weight * mask
-        rows = x.reshape(self.num_members, -1, x.shape[-1])
+        rows = x.reshape(len(weight), -1, x.shape[-1])
         if bias:
             y = torch.baddbmm(bias[0][:, None], rows, weight.mT)
         else:
@@ -106,20 +111,20 @@ class _LULinear(_Stacked):
 
     def forward(self, x: Tensor, context: Any = None) -> tuple[Tensor, Tensor]:
         lower, upper, log_det, bias = self._matrices()
-        rows = x.reshape(self.num_members, -1, x.shape[-1])
+        rows = x.reshape(len(bias), -1, x.shape[-1])
         y = rows @ upper.mT @ lower.mT + bias[:, None]
         return y.reshape(x.shape), log_det.repeat_interleave(rows.shape[1])
 
     def inverse(self, x: Tensor, context: Any = None) -> tuple[Tensor, Tensor]:
         lower, upper, log_det, bias = self._matrices()
-        rows = x.reshape(self.num_members, -1, x.shape[-1]) - bias[:, None]
+        rows = x.reshape(len(bias), -1, x.shape[-1]) - bias[:, None]
         solve = torch.linalg.solve_triangular
         y = solve(lower, rows.mT, upper=False, unitriangular=True)
         y = solve(upper, y, upper=True).mT
         return y.reshape(x.shape), -log_det.repeat_interleave(rows.shape[1])
 
     def _matrices(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        one: Any = self._one[0]
+        one: Any = self.rest
         values = dict(zip(self.names, self.stacks, strict=True))
         diagonal = F.softplus(values["unconstrained_upper_diag"]) + one.eps
         lower = torch.diag_embed(torch.ones_like(diagonal))
@@ -130,26 +135,26 @@ class _LULinear(_Stacked):
 
 
 class _Loop(_Stacked):
-    """Any other module with parameters: each member's copy sees its own rows."""
+    """Any other module with parameters: each member sees its own rows.
 
-    # One module for each member, whose parameters are views of the stacks, also when
-    # gradients are computed: some layers evaluate their network once more then.
-    _each: Sequence[nn.Module] = ()
+    The parameters of the members are views of the stacks also when gradients are
+    computed, because some layers evaluate their network once more then.
+    """
 
     def forward(self, *rows: Any, **options: Any) -> Any:
         return self.answer(nn.Module.__call__, *rows, **options)
 
     def answer(self, question: Question, *rows: Any, **options: Any) -> Any:
-        count, E = len(rows[0]), self.num_members
+        count, E = len(rows[0]), len(self.stacks[0])
 
         def parts(value: Any) -> Sequence[Any]:
             is_rows = isinstance(value, Tensor) and value.ndim and len(value) == count
             return value.chunk(E) if is_rows else [value] * E
 
         answers = [
-            question(module, *args, **options)
-            for module, *args in zip(
-                self._modules_of_each(), *map(parts, rows), strict=True
+            question(self.member(parameters), *of_member, **options)
+            for parameters, *of_member in zip(
+                zip(*self.stacks, strict=True), *map(parts, rows), strict=True
             )
         ]
         if E == 1:
@@ -157,30 +162,6 @@ class _Loop(_Stacked):
         if isinstance(answers[0], Tensor):
             return torch.cat(answers)
         return type(answers[0])(map(torch.cat, zip(*answers, strict=True)))
-
-    def _modules_of_each(self) -> Sequence[nn.Module]:
-        if len(self._each) < self.num_members:
-            self._each = [copy.deepcopy(self._one[0]) for _ in range(self.num_members)]
-        self._each = self._each[: self.num_members]
-        for name, stack in zip(self.names, self.stacks, strict=True):
-            path, _, leaf = name.rpartition(".")
-            for module, value in zip(self._each, stack.unbind(), strict=True):
-                owner: Any = module.get_submodule(path)
-                owner._parameters[leaf] = value
-        return self._each
-
-    def train(self, mode: bool = True) -> Any:  # noqa: FBT001, FBT002
-        """Switch dropout and batch statistics of the members on or off."""
-        for module in self._each:
-            module.train(mode)
-        return super().train(mode)
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:  # noqa: FBT001, FBT002
-        self._each = ()
-        return super()._apply(fn, recurse)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_each": ()}
 
 
 STACKED: dict[type[nn.Module], type[_Stacked]] = {
@@ -216,7 +197,8 @@ class Ensemble(nn.Module):
                 raise ValueError("Expected members that differ in parameters only.")
         self.num_members = len(members)
         self.net = _stacked(members)
-        if len(members) > 1 and not _keeps_rows(members[0], question, example):
+        is_one = len(members) == 1 or not list(self.parameters())
+        if not is_one and not _keeps_rows(members[0], question, example):
             self.net = _Loop(members)
         self.eval()
 
@@ -231,26 +213,21 @@ class Ensemble(nn.Module):
 
     def __getitem__(self, numbers: Tensor | Sequence[int]) -> "Ensemble":
         """Return an ensemble of copies of some members."""
-        some = copy.deepcopy(self)
         numbers = torch.arange(len(self))[torch.as_tensor(numbers)]
-        some.num_members = len(numbers)
-        for layer in some.layers():
-            layer.num_members = len(numbers)
-            for stack in layer.stacks:
-                stack.data = stack.data[numbers]
-                stack.grad = None
-        return some
+        return self._of([one[numbers] for one in self.parameters()], len(numbers))
 
     @classmethod
     def joined(cls, ensembles: Sequence["Ensemble"]) -> "Ensemble":
         """Return an ensemble of the members of several, of one architecture."""
-        one = copy.deepcopy(ensembles[0])
-        one.num_members = sum(map(len, ensembles))
-        for layers in zip(one.layers(), *(e.layers() for e in ensembles), strict=True):
-            first, *each = layers
-            first.num_members = one.num_members
-            for number, stack in enumerate(first.stacks):
-                stack.data = torch.cat([layer.stacks[number].data for layer in each])
+        stacks = zip(*(one.parameters() for one in ensembles), strict=True)
+        return ensembles[0]._of(list(map(torch.cat, stacks)), sum(map(len, ensembles)))
+
+    def _of(self, stacks: Sequence[Tensor], count: int) -> "Ensemble":
+        """Return a copy with other parameters, those of so many members."""
+        one = copy.deepcopy(self)
+        one.num_members = count
+        for parameter, stack in zip(one.parameters(), stacks, strict=True):
+            parameter.data, parameter.grad = stack.detach(), None
         return one
 
     def then(self, layer: nn.Module) -> "Ensemble":
@@ -261,25 +238,17 @@ class Ensemble(nn.Module):
 
     def member(self, number: int) -> Any:
         """Return a copy of one member, a network of its own."""
-        net = copy.deepcopy(self.net)
-        if isinstance(net, _Stacked):
-            return net.member(number).eval()
-        for module in list(net.modules()):
+
+        def unstacked(module: nn.Module) -> nn.Module:
+            if isinstance(module, _Stacked):
+                own = (nn.Parameter(s[number], s.requires_grad) for s in module.stacks)
+                return module.member(list(own))
             for name, child in module._modules.items():
-                if isinstance(child, _Stacked):
-                    module._modules[name] = child.member(number)
-        return net.eval()
+                if child is not None:
+                    module._modules[name] = unstacked(child)
+            return module
 
-    def layers(self) -> list[_Stacked]:
-        """Return the modules that hold the parameters, in the order of the network."""
-        return [part for part in self.net.modules() if isinstance(part, _Stacked)]
-
-
-def resize(network: nn.Module, old: int, new: int) -> None:
-    """Tell the ensembles in a network that their stacks hold another number now."""
-    for part in network.modules():
-        if isinstance(part, Ensemble | _Stacked) and part.num_members == old:
-            part.num_members = new
+        return copy.deepcopy(unstacked(copy.deepcopy(self.net))).eval()
 
 
 def _stacked(members: Sequence[nn.Module]) -> Any:
@@ -289,18 +258,15 @@ def _stacked(members: Sequence[nn.Module]) -> Any:
     def replaced(module: Any, others: Sequence[Any]) -> nn.Module:
         if id(others[0]) in done:
             return done[id(others[0])]
-        kind = STACKED.get(type(module))
-        own = [*module.parameters(recurse=False)]
-        if kind is not None and own[0].ndim > 2:  # zuko's stacks of linear layers
-            kind = None
-        if kind is not None or own:
-            done[id(others[0])] = (kind or _Loop)(others)
+        if own := list(module.parameters(recurse=False)):
+            kind = STACKED.get(type(module), _Loop)
+            # zuko has stacks of linear layers, too.
+            done[id(others[0])] = (_Loop if own[0].ndim > 2 else kind)(others)
             return done[id(others[0])]
         for name, child in module._modules.items():
             if child is not None:
-                module._modules[name] = replaced(
-                    child, [other._modules[name] for other in others]
-                )
+                of_each = [other._modules[name] for other in others]
+                module._modules[name] = replaced(child, of_each)
         return module
 
     return replaced(copy.deepcopy(members[0]), members)
@@ -311,18 +277,15 @@ def _keeps_rows(
     member: nn.Module, question: Question, example: Sequence[Tensor]
 ) -> bool:
     """Tell whether two members answer in one network as each does alone."""
-    other = copy.deepcopy(member).eval()
+    first, other = copy.deepcopy(member).eval(), copy.deepcopy(member).eval()
     with seeded(0):
         for parameter in other.parameters():
             scale = parameter.abs().mean() + 0.01
             parameter.add_(0.1 * scale * torch.randn_like(parameter))
-    first = copy.deepcopy(member).eval()
     alone = torch.cat([question(net, *example) for net in (first, other)])
+    rows = [torch.cat([part, part]) for part in example]
     try:
-        together = _stacked([first, other]).eval()
-        if isinstance(together, _Loop):
-            return True
-        rows = [torch.cat([part, part]) for part in example]
-        return torch.allclose(question(together, *rows), alone, rtol=1e-3, atol=1e-3)
-    except (RuntimeError, ValueError, TypeError):
+        found = question(_stacked([first, other]).eval(), *rows)
+        return torch.allclose(found, alone, rtol=1e-3, atol=1e-3)
+    except (RuntimeError, ValueError, TypeError, AttributeError):
         return False

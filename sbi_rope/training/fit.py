@@ -9,13 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from sbi_rope.training.ensemble import resize
 from sbi_rope.utils.errors import warn_user
 from sbi_rope.utils.progress import progress_bar
 from sbi_rope.utils.settings import Count, Level, Positive, Settings
 
-# More epochs than this are no limit.
-LARGEST_LIMIT = 10**6
 # A course that made the loss worse is repeated from the better state with this share of
 # its rate, and not more often than so many times.
 LOWER, MAX_LOWERED = 0.3, 2
@@ -122,8 +119,8 @@ def fit(
     Args:
         network: A module, or E members whose parameters are stacked. Parameters that
             require no gradient are left alone, unless none does.
-        batches: Given the number of the epoch, the batches to pass over. Each part of
-            a batch for an ensemble has the rows of member e at ``part[e]``.
+        batches: Returns the batches of an epoch, given its number. Each part of a batch
+            for an ensemble has the rows of member e at ``part[e]``.
         loss: Of a batch, the mean loss of each member, ``(E,)``, or of the module.
             Members that have stopped are not in the batch and in the network any more.
         training: Learning rate and so on; ``batches`` has the size of the batches.
@@ -141,7 +138,7 @@ def fit(
     if not any(parameter.requires_grad for parameter in network.parameters()):
         network.requires_grad_()
     optimiser = _Adam(network, training.clip_max_norm)
-    E = optimiser.num_members
+    E = len(optimiser.values)
     # Members of ensembles share buffers, which stay as they are.
     own = [] if hasattr(network, "num_members") else network.buffers()
     buffers = [buffer.detach()[None] for buffer in own]
@@ -165,16 +162,12 @@ def fit(
         for e, value in zip(members.tolist(), new.tolist(), strict=True):
             losses[e].append(value)
 
-    total = last if last < LARGEST_LIMIT else math.inf
-    progress = progress_bar(
-        range(last + 1), show=show_progress_bars, total=total, desc=label
-    )
+    progress = progress_bar(range(last + 1), show=show_progress_bars, desc=label)
     network.eval()
     for epoch in progress:
         state = [optimiser.values, *buffers]
-        better = going & (validation_loss is None)
-        gain = torch.zeros(len(members), dtype=torch.double)
         is_over = courses is None or epoch in (0, start + length)
+        better, gain = going & (validation_loss is None), best_loss[members]
         if validation_loss is not None and is_over:
             with torch.no_grad():
                 score = validation_loss(*of_members(held_out)).detach()
@@ -234,7 +227,9 @@ def fit(
             f"{label}: the loss of {num_lost} of {E} networks is not finite; their "
             "best states before are kept. Use a smaller learning rate."
         )
-    optimiser.finish(best[0])
+    optimiser.show(best[0])
+    for parameter in optimiser.parameters:  # give each memory of its own
+        parameter.data = parameter.data.clone(memory_format=torch.contiguous_format)
     for buffer, kept in zip(buffers, best[1:], strict=True):
         buffer.copy_(kept)
     network.requires_grad_(requires_grad=False)
@@ -256,78 +251,60 @@ def _fall(losses: Sequence[float], length: int) -> float:
 class _Adam:
     """Adam with a step size, and a limit on the gradient's norm, for each member.
 
-    While it is in use, the parameters are views of one tensor.
-
-    Attributes:
-        values: The parameters of each member, side by side, ``(E, P)``.
+    While it is in use, the parameters are views of ``values``, which has those of each
+    member side by side, ``(E, P)``.
     """
 
     def __init__(self, network: nn.Module, clip_max_norm: float | None) -> None:
-        self.network = network
         self.parameters = [one for one in network.parameters() if one.requires_grad]
         self.clip_max_norm = clip_max_norm
-        self.num_members = getattr(network, "num_members", 1)
-        self.sizes = [one.numel() // self.num_members for one in self.parameters]
-        self.values = self._side_by_side(self.parameters).detach()
-        self._show()
+        count = getattr(network, "num_members", 1)
+        self.sizes = [one.numel() // count for one in self.parameters]
+        self.show(_side_by_side(self.parameters, count).detach())
         self.restart()
 
     def restart(self) -> None:
         """Forget all gradients."""
         self.first = torch.zeros_like(self.values)
         self.second = torch.zeros_like(self.values)
-        self.count = 0
+        self.num_steps = 0
+
+    def show(self, values: Tensor) -> None:
+        """Make the parameters views of these values."""
+        self.values = values
+        parts = values.split(self.sizes, dim=1)
+        for parameter, part in zip(self.parameters, parts, strict=True):
+            shape = parameter.shape
+            parameter.data = part.view((-1, *shape[1:]) if shape else ())
 
     def keep_only(self, going: Tensor) -> None:
         """Take the members out of the network that have stopped."""
         self.first, self.second = self.first[going], self.second[going]
-        self._resize(self.values[going])
-
-    def finish(self, values: Tensor) -> None:
-        """Give all members these parameters, each with memory of its own."""
-        self._resize(values)
-        for parameter in self.parameters:
-            parameter.data = parameter.data.clone(memory_format=torch.contiguous_format)
-
-    def _resize(self, values: Tensor) -> None:
-        if len(values) != self.num_members:
-            resize(self.network, self.num_members, len(values))
-        self.values, self.num_members = values, len(values)
-        self._show()
+        self.show(self.values[going])
 
     def step(self, losses: Tensor, rates: Tensor) -> None:
         """Lower the losses of all members, ``(E,)``, each with its step size."""
-        finite = torch.isfinite(losses.detach())
-        gradients = torch.autograd.grad(
-            losses[finite].sum(), self.parameters, allow_unused=True
+        total = losses[torch.isfinite(losses.detach())].sum()
+        found = torch.autograd.grad(
+            total, self.parameters, allow_unused=True, materialize_grads=True
         )
         with torch.no_grad():
-            pairs = zip(gradients, self.parameters, strict=True)
-            gradient = self._side_by_side(
-                [torch.zeros_like(of) if one is None else one for one, of in pairs]
-            )
+            gradient = _side_by_side(found, len(self.values))
             norm = gradient.norm(dim=1, keepdim=True)
             if not torch.isfinite(norm).all():
                 norm = gradient.nan_to_num_(0.0, 0.0, 0.0).norm(dim=1, keepdim=True)
             if self.clip_max_norm is not None:
                 gradient *= (self.clip_max_norm / (norm + 1e-6)).clamp(max=1.0)
-            self.count += 1
+            self.num_steps += 1
             self.first.lerp_(gradient, 1 - BETAS[0])
             self.second.mul_(BETAS[1]).addcmul_(gradient, gradient, value=1 - BETAS[1])
-            scale = self.second.sqrt().div_(math.sqrt(1 - BETAS[1] ** self.count))
-            size = rates.where(finite.cpu(), 0.0).to(gradient)
-            size /= 1 - BETAS[0] ** self.count
+            scale = self.second.sqrt().div_(math.sqrt(1 - BETAS[1] ** self.num_steps))
+            size = rates.to(gradient) / (1 - BETAS[0] ** self.num_steps)
             self.values -= self.first / scale.add_(EPSILON) * size[:, None]
 
-    def _side_by_side(self, tensors: Sequence[Tensor]) -> Tensor:
-        return torch.cat([one.reshape(self.num_members, -1) for one in tensors], dim=1)
 
-    def _show(self) -> None:
-        """Make the parameters views of the values."""
-        parts = self.values.split(self.sizes, dim=1)
-        for parameter, part in zip(self.parameters, parts, strict=True):
-            shape = parameter.shape
-            parameter.data = part.view((-1, *shape[1:]) if shape else ())
+def _side_by_side(tensors: Sequence[Tensor], count: int) -> Tensor:
+    return torch.cat([one.reshape(count, -1) for one in tensors], dim=1)
 
 
 @contextmanager

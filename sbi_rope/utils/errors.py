@@ -67,15 +67,8 @@ def shown(value: Any) -> str:
 
 
 def warn_user(message: str) -> None:
-    """Issue a :class:`RoPEWarning` that points at the line of the user's code.
-
-    That line is the innermost call that was made neither by this package, sbi or torch,
-    nor by the standard library between two calls of theirs.
-    """
+    """Issue a :class:`RoPEWarning` that points at the line of the user's code."""
     level, frame = 1, inspect.currentframe()
-    while frame is not None:
-        package = frame.f_globals.get("__name__", "").split(".")[0]
-        if package not in PASSED_OVER:
-            break
+    while frame and frame.f_globals.get("__name__", "").split(".")[0] in PASSED_OVER:
         level, frame = level + 1, frame.f_back
     warnings.warn(message, RoPEWarning, stacklevel=level)

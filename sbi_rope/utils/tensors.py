@@ -96,15 +96,6 @@ def column_names(value: Any) -> tuple[str, ...] | None:
     return names if names and are_names and len(set(names)) == len(names) else None
 
 
-def check_same_length(theta: Tensor, x: Tensor) -> None:
-    """Raise if parameters and observations have different numbers of rows."""
-    if len(theta) != len(x):
-        raise InvalidInputError(
-            "Expected `theta` and `x` to have the same number of rows; got "
-            f"{len(theta)} and {len(x)}."
-        )
-
-
 def divisors(std: Tensor) -> Tensor:
     """Return standard deviations, or variances, with one in the place of zero."""
     return std.where(std > 0, 1.0)

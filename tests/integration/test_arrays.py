@@ -12,36 +12,19 @@ from sbi_rope.methods import DiscrepancyNPE, FinetunedNPE
 from sbi_rope.methods.training import Training
 from sbi_rope.metrics import draw_samples, evaluate
 from tests import gaussian, problems
-from tests.stacks import (
-    NPE,
-    PRIOR,
-    QUICK,
-    QUIET,
-    problem,
-    stacked,
-)
+from tests.stacks import NPE, PRIOR, QUICK, QUIET, problem, stacked
 
 PAIRS, OBSERVED = problem(12, seed=1), problem(25, seed=2)
 QUICKLY: dict[str, Any] = {"num_simulations": 60, "seed": 0, **QUIET}
 
 
-def array(tensor: Tensor) -> Any:
-    """Return an array of float64, as NumPy makes them."""
-    return tensor.double().numpy()
-
-
-def rope(pairs: Any) -> RoPE:
-    rope = RoPE(
-        problems.npe_posterior("mdn"), simulator=problems.simulate, finetuner=QUICK
-    )
-    return rope.append_calibration(*pairs)
-
-
 @pytest.mark.medium
-@pytest.mark.parametrize("convert", [array, Tensor.tolist], ids=["arrays", "lists"])
+@pytest.mark.parametrize("convert", [Tensor.tolist, lambda x: x.double().numpy()])
 def test_pairs_and_observations_are_those_of_tensors(convert: Any) -> None:
     theta_o, x_o = map(convert, OBSERVED)
-    given = rope(map(convert, PAIRS))
+    npe = problems.npe_posterior("mdn")
+    given = RoPE(npe, simulator=problems.simulate, finetuner=QUICK)
+    given.append_calibration(*map(convert, PAIRS))
     for ours, tensor in zip(given.calibration, PAIRS, strict=True):
         assert ours.dtype == torch.float32
         assert torch.equal(ours, tensor)
@@ -53,7 +36,7 @@ def test_pairs_and_observations_are_those_of_tensors(convert: Any) -> None:
     assert torch.allclose(log_prob.float(), posterior.log_prob_batched(*OBSERVED))
     assert posterior.sample((3,), x=x_o[1]).shape == (3, 2)
     assert posterior.sample_batched((3,), x=x_o, **QUIET).shape == (3, 25, 2)
-    for scored in (posterior, problems.npe_posterior("mdn")):
+    for scored in (posterior, npe):
         scores = evaluate(scored, theta_o, x_o, num_samples=20, seed=0, **QUIET)
         expected = evaluate(scored, *OBSERVED, num_samples=20, seed=0, **QUIET)
         assert scores.as_row() == pytest.approx(expected.as_row(), nan_ok=True)

@@ -5,12 +5,25 @@ from typing import Any
 
 import pytest
 import torch
+from sbi.neural_nets import likelihood_nn
 from torch import Tensor, nn
-from torch.distributions import Independent, MultivariateNormal, Normal
+from torch.distributions import (
+    Categorical,
+    Independent,
+    MixtureSameFamily,
+    MultivariateNormal,
+    Normal,
+)
 
 from sbi_rope.baselines import RVNP, Training
-from sbi_rope.baselines.rvnp import Bound, ErrorModel, fit_surrogate, log_likelihood
-from sbi_rope.npe.sbi import estimator_of, gaussians_of
+from sbi_rope.baselines.rvnp import (
+    Bound,
+    ErrorModel,
+    fit_surrogate,
+    gaussians_of,
+    log_likelihood,
+)
+from sbi_rope.npe.sbi import estimator_of
 from tests import gaussian
 
 QUIET: dict[str, Any] = {"seed": 0, "show_progress_bars": False}
@@ -44,6 +57,22 @@ def bent_errors() -> ErrorModel:
 
 
 # Densities.
+
+
+def test_the_gaussians_of_a_mixture_density_network_have_its_density() -> None:
+    torch.manual_seed(0)
+    theta, x = torch.randn(50, 2), torch.randn(50, 3)
+    network = likelihood_nn("mdn", z_score_x="none", num_components=3)(theta, x)
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.2)
+    logits, means, covariances = gaussians_of(network, theta)
+    correlated = covariances - torch.diag_embed(covariances.diagonal(dim1=-2, dim2=-1))
+    assert correlated.abs().mean() > 0.1
+    law = MixtureSameFamily(
+        Categorical(logits=logits), MultivariateNormal(means, covariances)
+    )
+    expected = network.log_prob(x[None], theta)[0].double()
+    torch.testing.assert_close(law.log_prob(x), expected, atol=0.02, rtol=0.01)
 
 
 @pytest.mark.medium

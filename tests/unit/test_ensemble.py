@@ -148,7 +148,7 @@ def test_every_embedding_net_is_trained_at_once_as_alone(name: str) -> None:
     check_as_trained_alone(estimator_behind(name))
 
 
-@pytest.mark.parametrize("family", [*FAMILIES, "mnpe"])
+@pytest.mark.parametrize("family", ["mdn", "nsf", "zuko_nsf", "mnpe"])
 def test_draws_of_each_member_are_those_of_its_density(family: str) -> None:
     each = members(headless(estimator_of(problems.npe_posterior(family))))
     z = torch.randn(1, each[0].condition_shape[0]).expand(NUM_MEMBERS * 400, -1)
@@ -161,12 +161,12 @@ def test_draws_of_each_member_are_those_of_its_density(family: str) -> None:
         assert (difference < 4.5 * error + 1e-6).all()
 
 
-@pytest.mark.parametrize("name", ["linear", "transposed", "conv"])
-def test_members_can_be_taken_out_and_joined(name: str) -> None:
+@pytest.mark.parametrize("name", ["linear", "transposed", "conv", "recurrent"])
+def test_members_can_be_moved_taken_out_and_joined(name: str) -> None:
     make, shape = NETS[name]
     each = members(make())
     x = torch.randn(5, *shape)
-    ensemble = Ensemble(each, embedded, (x,))
+    ensemble = Ensemble(each, embedded, (x,)).double().float()
     for number, net in enumerate(each):
         assert torch.allclose(ensemble.member(number)(x), net(x), atol=1e-5)
     some = ensemble[[2, 0]]

@@ -39,17 +39,13 @@ def small(net: nn.Module | None = None) -> Any:
     return posterior_nn("mdn", embedding_net=net, hidden_features=8, num_components=2)
 
 
-class TestEstimatorBuilder:
-    def test_each_estimator_has_a_copy_of_the_net(self) -> None:
-        net = nn.Linear(3, 2)
-        build = estimator_builder(small(net))
-        theta, x = torch.randn(20, 2), torch.randn(20, 3)
-        first, second = build(theta, x), build(theta, x)
-        own = {id(p) for p in net.parameters()}
-        for estimator, other in [(first, second), (second, first)]:
-            ids = {id(p) for p in estimator.parameters()}
-            assert not ids & own
-            assert not ids & {id(p) for p in other.parameters()}
+def test_each_estimator_has_a_copy_of_the_net() -> None:
+    net = nn.Linear(3, 2)
+    build = estimator_builder(small(net))
+    theta, x = torch.randn(20, 2), torch.randn(20, 3)
+    each = [net, build(theta, x), build(theta, x)]
+    ids = [id(p) for one in each for p in one.parameters()]
+    assert len(set(ids)) == len(ids)
 
 
 def pairs(n: int) -> tuple[Tensor, Tensor]:
@@ -69,62 +65,52 @@ def with_sbi(n: int = 60, **options: Any) -> tuple[Any, History]:
     )
 
 
-class TestTrainWithSBI:
-    def test_it_prints_nothing_and_writes_nothing(
-        self,
-        tmp_path: Path,
-        monkeypatch: pytest.MonkeyPatch,
-        capsys: pytest.CaptureFixture[str],
-    ) -> None:
-        monkeypatch.chdir(tmp_path)
-        with_sbi()
-        with_sbi(stop_after_epochs=1, max_num_epochs=100, learning_rate=0.1)
-        assert os.listdir(tmp_path) == []
-        printed = capsys.readouterr()
-        assert printed.out == printed.err == ""
-
-    def test_the_history_is_that_of_the_epochs(self) -> None:
-        estimator, history = with_sbi(learning_rate=0.05, max_num_epochs=40)
-        assert len(history.training_loss) == len(history.validation_loss)
-        assert history.kept_validation_loss == min(history.validation_loss)
-        assert history.validation_loss[history.best_epoch] < history.validation_loss[0]
-        assert history.learning_rate == 0.05
-        assert len(history.training_loss) <= 40
-        assert not estimator.training
+def test_training_prints_nothing_and_writes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with_sbi(stop_after_epochs=1, max_num_epochs=100, learning_rate=0.1)
+    assert os.listdir(tmp_path) == []
+    printed = capsys.readouterr()
+    assert printed.out == printed.err == ""
 
 
-def split_of(make_trainer: Any, theta: Tensor) -> tuple[Tensor, Tensor]:
-    trainer = make_trainer(prior=box(2), show_progress_bars=False)
-    trainer.append_simulations(theta, simulate(theta))
-    torch.manual_seed(0)
-    trainer.get_dataloaders(training_batch_size=10, validation_fraction=0.2)
-    return trainer.train_indices, trainer.val_indices
+def test_the_history_is_that_of_the_epochs() -> None:
+    estimator, history = with_sbi(learning_rate=0.05, max_num_epochs=40)
+    assert len(history.training_loss) == len(history.validation_loss) <= 40
+    assert history.kept_validation_loss == min(history.validation_loss)
+    assert history.validation_loss[history.best_epoch] < history.validation_loss[0]
+    assert not estimator.training
 
 
-class TestSimulationTrainer:
-    def test_without_recordings_of_the_same_it_is_the_split_of_sbi(self) -> None:
-        theta = box(2).sample((50,))
-        for ours, sbis in zip(
-            split_of(SimulationTrainer, theta), split_of(NPE, theta), strict=True
-        ):
-            assert torch.equal(ours, sbis)
+def test_without_recordings_of_the_same_it_is_the_split_of_sbi() -> None:
+    theta = box(2).sample((50,))
+    splits = []
+    for make_trainer in (SimulationTrainer, NPE):
+        trainer = make_trainer(prior=box(2), show_progress_bars=False)
+        trainer.append_simulations(theta, simulate(theta))
+        torch.manual_seed(0)
+        trainer.get_dataloaders(training_batch_size=10, validation_fraction=0.2)
+        splits.append((trainer.train_indices, trainer.val_indices))
+    assert all(map(torch.equal, *splits))
 
-    def test_recordings_of_a_person_are_held_out_together(self) -> None:
-        """Where fewer than a batch of 20 are left, or hardly any held out, too."""
-        for sizes in [(1, 19), (6, 7, 12), (2, 2, 30), (6,) * 12]:
-            people = box(2).sample((len(sizes),))
-            theta = people.repeat_interleave(torch.tensor(sizes), dim=0)
-            for seed in range(6):
-                torch.manual_seed(seed)
-                trainer = SimulationTrainer(prior=box(2), show_progress_bars=False)
-                trainer.append_simulations(theta, simulate(theta))
-                loaders = trainer.get_dataloaders(0, 20, 0.3)
-                rows = trainer.train_indices, trainer.val_indices
-                assert sorted(torch.cat(rows).tolist()) == list(range(len(theta)))
-                train, held_out = (set(map(tuple, theta[r].tolist())) for r in rows)
-                assert train
-                assert held_out
-                assert not train & held_out
-                assert len(rows[0]) >= len(rows[1])
-                for loader in loaders:
-                    assert sum(len(batch[0]) for batch in loader) > 0
+
+def test_recordings_of_a_person_are_held_out_together() -> None:
+    """Where fewer than a batch of 20 are left, or hardly any held out, too."""
+    for sizes in [(1, 19), (6, 7, 12), (2, 2, 30), (6,) * 12]:
+        people = box(2).sample((len(sizes),))
+        theta = people.repeat_interleave(torch.tensor(sizes), dim=0)
+        for seed in range(6):
+            torch.manual_seed(seed)
+            trainer = SimulationTrainer(prior=box(2), show_progress_bars=False)
+            trainer.append_simulations(theta, simulate(theta))
+            loaders = trainer.get_dataloaders(0, 20, 0.3)
+            rows = trainer.train_indices, trainer.val_indices
+            assert sorted(torch.cat(rows).tolist()) == list(range(len(theta)))
+            train, held_out = (set(map(tuple, theta[r].tolist())) for r in rows)
+            assert train
+            assert held_out
+            assert not train & held_out
+            assert len(rows[0]) >= len(rows[1])
+            for loader in loaders:
+                assert sum(len(batch[0]) for batch in loader) > 0
