@@ -15,23 +15,18 @@ Each score is that of the posterior of fold k(i), which has not seen the pair:
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_rope.npe.sbi import MixedDensity
 from sbi_rope.utils.errors import InvalidInputError
 from sbi_rope.utils.seeds import seeded
 from sbi_rope.utils.settings import Count, Level, check, default_names
 from sbi_rope.utils.tensors import as_batch, as_numbers
 
 LOWEST_LEVEL = 0.5  # Below, the guarantee says nothing, and intervals may be empty.
-# A set reaches further than the draws of a stack that is too narrow. To measure it,
-# draws are moved away from their mean by these factors.
-STRETCHES = (1.0, 2.0, 4.0)
 MAX_PRINTED = 20  # intervals
 NO_GUARANTEE = "There is no guarantee. The level is right for calibrated posteriors."
 
@@ -221,31 +216,24 @@ class SetScores:
         return Guarantee(level=level, num_pairs=n, num_folds=len(self.weights))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class CredibleSet:
-    r"""A set of parameters that are credible given an observation, or each of a batch.
+    """A set of parameters that are credible given an observation, or each of a batch.
 
-    ``posterior.credible_set`` makes it. Its volume is estimated from draws
-    :math:`\theta_k` of a density q when it is first asked for:
-
-    .. math:: V = \frac1m \sum_k \frac{\mathbf{1}[\theta_k \in A]}{q(\theta_k)}
+    ``posterior.credible_set`` makes it.
 
     Attributes:
         level: The level that was asked for.
         guarantee: The guarantee; None if there is none.
-        draws: The draws of q, shape ``(m, d)``, or ``(m, B, d)`` of a batch.
+        shape: The shape of parameters, ``(d,)``, or ``(B, d)`` of a batch.
         rule: Tells which parameters ``(n, B, d)`` are in the sets, ``(n, B)``.
-        log_density: Returns :math:`\log q` of the draws, ``(m, B)``.
-        log_unit: The sum of the logs of the prior's standard deviations.
         parameter_names: One name for each parameter; None if they have none.
     """
 
     level: float
     guarantee: Guarantee | None
-    draws: Tensor
+    shape: tuple[int, ...]
     rule: Callable[[Tensor], Tensor]
-    log_density: Callable[[], Tensor]
-    log_unit: float
     parameter_names: tuple[str, ...] | None
 
     @torch.no_grad()
@@ -254,48 +242,17 @@ class CredibleSet:
 
         For sets of a batch these are ``(*batch, B, d)`` and ``(*batch, B)``.
         """
-        rows, shape = _rows(theta, self.draws[0], self.parameter_names)
+        rows, shape = _rows(theta, self.shape, self.parameter_names)
         return self.rule(rows.reshape(len(rows), -1, shape[-1])).reshape(shape[:-1])
 
-    @cached_property
-    def _terms(self) -> Tensor:
-        inside = self.contains(self.draws)
-        log_density = self.log_density().double().reshape(inside.shape)
-        return torch.exp(-log_density).where(inside, 0.0)
-
-    @property
-    def volume(self) -> Tensor:
-        """The volume in the units of the parameters, shape ``()`` or ``(B,)``."""
-        return self._terms.mean(dim=0)
-
-    @property
-    def volume_error(self) -> Tensor:
-        """The Monte-Carlo standard error of ``volume``."""
-        return self._terms.std(dim=0) / len(self._terms) ** 0.5
-
-    @property
-    def volume_z(self) -> Tensor:
-        """The volume in standard deviations of the prior; NaN if it has none."""
-        return self.volume * math.exp(-self.log_unit)
-
     def __str__(self) -> str:
-        dim = self.draws.shape[-1]
-        if self.draws.ndim > 2:
-            least, most = self.volume.min(), self.volume.max()
-            size = f"volumes of {least:.3g} to {most:.3g}, by observation"
-        else:
-            size = f"a volume of {self.volume:.3g} +- {self.volume_error:.1g}"
-            if not math.isnan(self.log_unit):
-                size += f", or {self.volume_z:.3g} in standard deviations of the prior"
-        return (
-            f"{100 * self.level:.4g}% set of {dim} parameter{'s' * (dim > 1)}, with "
-            f"{size}.\n{self.guarantee or NO_GUARANTEE}"
-        )
+        of = f"{100 * self.level:.4g}% set of {self.shape[-1]} parameter(s)."
+        return f"{of} {self.guarantee or NO_GUARANTEE}"
 
     __repr__ = __str__  # which notebooks show
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class CredibleIntervals:
     """An interval for each parameter given an observation, or each of a batch.
 
@@ -304,17 +261,17 @@ class CredibleIntervals:
     those of one observation.
 
     Attributes:
-        low: The lower ends, shape ``(d,)``, or ``(B, d)`` of a batch.
-        high: The upper ends, as ``low``.
         level: The level of each interval.
         guarantee: The guarantee of each interval; None if there is none.
+        low: The lower ends, shape ``(d,)``, or ``(B, d)`` of a batch.
+        high: The upper ends, as ``low``.
         parameter_names: One name for each parameter; None if they have none.
     """
 
-    low: Tensor
-    high: Tensor
     level: float
     guarantee: Guarantee | None
+    low: Tensor
+    high: Tensor
     parameter_names: tuple[str, ...] | None
 
     def __getitem__(self, index: int | slice) -> "CredibleIntervals":
@@ -327,7 +284,8 @@ class CredibleIntervals:
         They have the shape ``(*batch, d)``, or ``(*batch, B, d)`` for intervals of a
         batch, and so has the result.
         """
-        rows, shape = _rows(theta, self.low, self.parameter_names)
+        rows, shape = _rows(theta, self.low.shape, self.parameter_names)
+        rows = rows.to(self.low)
         return ((self.low <= rows) & (rows <= self.high)).reshape(shape)
 
     def as_rows(self) -> list[dict[str, Any]]:
@@ -346,36 +304,29 @@ class CredibleIntervals:
         return [{"parameter": name, "low": a, "high": b} for name, a, b in ends]
 
     def __str__(self) -> str:
-        lines = [f"{100 * self.level:.4g}% intervals, one by one:"]
-        rows = self.as_rows()
+        lines, rows = (
+            [f"{100 * self.level:.4g}% intervals, one by one:"],
+            self.as_rows(),
+        )
         for row in rows[:MAX_PRINTED]:
             of = f" observation {row['observation']}," if "observation" in row else ""
-            ends = _ends_in_words(row["low"], row["high"])
+            ends = f"{row['low']:.6g} to {row['high']:.6g}"
             lines.append(f" {of} {row['parameter']}: {ends}")
         if len(rows) > MAX_PRINTED:
             lines.append(f"  and {len(rows) - MAX_PRINTED} more")
-        promise = str(self.guarantee or NO_GUARANTEE)
-        if self.low.shape[-1] > 1:
-            promise += " All parameters together are inside less often."
-        return "\n".join([*lines, promise])
+        promise = f"{self.guarantee or NO_GUARANTEE}"
+        lines.append(f"{promise} All parameters together are inside less often.")
+        return "\n".join(lines)
 
     __repr__ = __str__  # which notebooks show
 
 
-def _rows(theta: Any, like: Tensor, names: Any) -> tuple[Tensor, torch.Size]:
-    """Return parameters as ``(n, *like.shape)``, and the shape that they had."""
+def _rows(theta: Any, shape: Sequence[int], names: Any) -> tuple[Tensor, torch.Size]:
+    """Return parameters as ``(n, *shape)``, and the shape that they had."""
     theta = as_numbers("theta", theta, names=names)
-    rows = theta if theta.ndim > like.ndim else theta[None]
-    rows = rows.flatten(0, max(0, rows.ndim - like.ndim - 1))
-    return as_batch("theta", rows, like.shape).to(like), theta.shape
-
-
-def _ends_in_words(low: float, high: float) -> str:
-    """Return both ends, with digits enough to see how wide the interval is."""
-    digits, width, largest = 4, high - low, max(abs(low), abs(high))
-    if 0 < width < math.inf:
-        digits = max(digits, 3 + math.floor(math.log10(largest / width)))
-    return f"{low:.{digits}g} to {high:.{digits}g}"
+    given, count = theta.shape, len(shape)
+    rows = theta if theta.ndim > count else theta[None]
+    return as_batch("theta", rows.flatten(0, rows.ndim - count - 1), shape), given
 
 
 class MakesSets:
@@ -406,49 +357,51 @@ class MakesSets:
             guaranteed: Whether the set shall hold the true parameters in about
                 ``level`` of the cases, even if the posterior is not calibrated. This
                 needs a stack, and observations drawn as its calibration pairs.
-            num_samples: The number of draws that the set and its volume are estimated
-                from. At least one of them has to be outside the set.
+            num_samples: The number of draws, of which at least one has to be outside
+                the set. With ``guaranteed`` there are as many as the stack was scored
+                with.
             seed: Seed of the draws; None uses the states of torch, NumPy and Python.
 
         Returns:
-            The set, which tells its volume and which parameters it contains.
+            The set, which tells which parameters it contains.
 
         Raises:
-            InvalidInputError: If x is not in the batch and ``unseen="raise"``. With
-                ``guaranteed``, also if this is no stack, or if it has too few pairs.
+            InvalidInputError: With ``guaranteed``, if this is no stack, or if it has
+                too few pairs.
         """
-        x, is_one = _checked(self, level, x, num_samples, 0 if guaranteed else 1)
-        guarantee, stacks, fold, rank = None, [self], torch.tensor([0]), 1
+        x, shape = _checked(self, level, x, num_samples, 0 if guaranteed else 1)
+        guarantee = None
         with seeded(seed), torch.no_grad():
             if guaranteed:
                 pairs, stacks = self._held_out()
-                guarantee = pairs.guarantee(level)
-                fold, rank = pairs.fold, rank_needed(level, len(pairs))
-                scores = pairs.joint.to(x.device)
-                draws, log_density = _spread(self, x, num_samples)
-                log_probs = [
+                guarantee, rank = pairs.guarantee(level), rank_needed(level, len(pairs))
+                of_draws = [
                     _log_prob(one, _draw(one, pairs.num_draws, x), x) for one in stacks
                 ]
-            else:  # as if the draw at the quantile were the only pair
-                draws = _draw(self, num_samples, x)
-                log_probs = [_log_prob(self, draws, x)]
-                of_draws = joint_scores(log_probs[0], log_probs[0])
-                rank_of_draw = _round_up(level * num_samples)
-                scores = of_draws.kthvalue(rank_of_draw, keepdim=True).values[None]
-                log_density = partial(self.log_prob_batched, draws, x)
+                scores = pairs.joint.to(x.device)
+            else:
+                log_prob = _log_prob(self, _draw(self, num_samples, x), x)
+                number = num_samples + 1 - _round_up(level * num_samples)
+                least = log_prob.kthvalue(number, keepdim=True).values
 
         def rule(theta: Tensor) -> Tensor:
+            theta = theta.to(x)
+            if guarantee is None:
+                return (_log_prob(self, theta, x) >= least).T
             at_theta = [
-                joint_scores(_log_prob(stack, theta, x), of_draws)
-                for stack, of_draws in zip(stacks, log_probs, strict=True)
+                joint_scores(_log_prob(one, theta, x), draws)
+                for one, draws in zip(stacks, of_draws, strict=True)
             ]
-            held = is_held(scores, fold, torch.stack(at_theta), rank=rank).T
-            inside = self.prior.inside(theta.flatten(0, 1))
-            return held & inside.reshape(held.shape)
+            held = is_held(scores, pairs.fold, torch.stack(at_theta), rank=rank).T
+            return held & self.prior.inside(theta.flatten(0, 1)).reshape(held.shape)
 
-        draws = draws[:, 0] if is_one else draws
-        unit, names = float(self.prior.log_units().sum()), self.parameter_names
-        return CredibleSet(level, guarantee, draws, rule, log_density, unit, names)
+        return CredibleSet(
+            level=level,
+            guarantee=guarantee,
+            shape=shape,
+            rule=rule,
+            parameter_names=self.parameter_names,
+        )
 
     def credible_intervals(
         self: Any,
@@ -461,42 +414,36 @@ class MakesSets:
     ) -> CredibleIntervals:
         """Return an interval for each parameter given an observation, or each of B.
 
-        It is the central interval of draws. With ``guaranteed``, a stack corrects it by
-        its out-of-fold scores.
-
-        Args:
-            level: The probability of each interval by itself.
-            x: As in :meth:`credible_set`.
-            guaranteed: As in :meth:`credible_set`.
-            num_samples: The number of draws. At least one of them has to be beyond each
-                end. With ``guaranteed`` there are as many as the stack was scored
-                with.
-            seed: As in :meth:`credible_set`.
-
-        Returns:
-            The intervals, with ends of shape ``(d,)``, or ``(B, d)`` of a batch.
+        It is the central interval of draws, of which at least one has to be beyond each
+        end. Arguments and errors are those of :meth:`credible_set`. The ends have the
+        shape ``(d,)``, or ``(B, d)`` of a batch.
         """
-        x, is_one = _checked(self, level, x, num_samples, 0 if guaranteed else 2)
+        x, shape = _checked(self, level, x, num_samples, 0 if guaranteed else 2)
         guarantee, of_folds = None, []
         with seeded(seed), torch.no_grad():
             if guaranteed:
                 pairs, stacks = self._held_out()
-                guarantee, n = pairs.guarantee(level), len(pairs)
+                guarantee, rank = pairs.guarantee(level), rank_needed(level, len(pairs))
                 for number, stack in enumerate(stacks):
                     draws = _draw(stack, pairs.num_draws, x).permute(1, 2, 0)
                     scores = pairs.marginal[pairs.fold == number].T.to(draws.device)
                     of_folds.append(marginal_ends(scores.expand(len(x), -1, -1), draws))
                 low, high = torch.cat(of_folds, dim=-1)
-                low = low.kthvalue(n + 1 - rank_needed(level, n)).values
-                high = high.kthvalue(rank_needed(level, n)).values
+                low = low.kthvalue(len(pairs) + 1 - rank).values
+                high = high.kthvalue(rank).values
                 least, most = self.prior.bounds(low)
                 low, high = low.clamp(least, most), high.clamp(least, most)
             else:
                 draws = _draw(self, num_samples, x).double().cpu().numpy()
                 tails = (1 - level) / 2, (1 + level) / 2
                 low, high = map(torch.from_numpy, np.quantile(draws, tails, axis=0))
-        low, high = (end[0] if is_one else end for end in (low.to(x), high.to(x)))
-        return CredibleIntervals(low, high, level, guarantee, self.parameter_names)
+        return CredibleIntervals(
+            level=level,
+            guarantee=guarantee,
+            low=low.to(x).reshape(shape),
+            high=high.to(x).reshape(shape),
+            parameter_names=self.parameter_names,
+        )
 
     def _held_out(self) -> tuple[SetScores, Sequence[Any]]:
         """Return out-of-fold scores, and the stack that has not seen each fold."""
@@ -508,8 +455,8 @@ class MakesSets:
 
 def _checked(
     posterior: Any, level: Any, x: Any, num_samples: Any, num_ends: int
-) -> tuple[Tensor, bool]:
-    """Return observations ``(B, *event)``, and whether a single one was given."""
+) -> tuple[Tensor, tuple[int, ...]]:
+    """Return observations ``(B, *event)``, and the shape of parameters they are for."""
     check("level", level, Level)
     check("num_samples", num_samples, Count)
     if num_samples < (needed := _round_up(num_ends / (1 - level))):
@@ -517,9 +464,11 @@ def _checked(
             f"Expected `num_samples` of at least {needed} for a level of {level:g}, so "
             f"that a draw is beyond each end; got {num_samples}."
         )
-    event = posterior.posterior_estimator.condition_shape
-    is_one = x is None or np.ndim(x) == len(event)
-    return posterior._one_x(x) if is_one else posterior._batch_of_x(x), is_one
+    density = posterior.posterior_estimator
+    if x is None or np.ndim(x) == len(density.condition_shape):
+        return posterior._one_x(x), tuple(density.input_shape)
+    x = posterior._batch_of_x(x)
+    return x, (len(x), *density.input_shape)
 
 
 def _draw(posterior: Any, num_samples: int, x: Tensor) -> Tensor:
@@ -529,32 +478,3 @@ def _draw(posterior: Any, num_samples: int, x: Tensor) -> Tensor:
 def _log_prob(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
     """Return log densities up to the mass in the prior's support, ``(B, M)``."""
     return posterior.log_prob_batched(theta, x, norm_posterior=False).T
-
-
-def _spread(
-    posterior: Any, x: Tensor, num_samples: int
-) -> tuple[Tensor, Callable[[], Tensor]]:
-    r"""Return draws that reach further than the stack, and their log density.
-
-    .. math:: q(\theta) = \frac14 \Big( p(\theta) + \sum_{s \in \{1, 2, 4\}}
-        s^{-d}\, p\big(\mu + (\theta - \mu) / s \mid x\big) \Big)
-    """
-    prior, modules = posterior.prior, posterior.posterior_estimator.modules()
-    # Discrete parameters that are moved would be between the categories.
-    is_mixed = any(isinstance(module, MixedDensity) for module in modules)
-    stretches = STRETCHES[:1] if is_mixed else STRETCHES
-    count = math.ceil(num_samples / (1 + len(stretches)))
-    draws = _draw(posterior, count, x)
-    mean = draws.mean(dim=0)
-    of_prior = prior.sample((count, len(x))).to(draws)
-    theta = torch.cat([of_prior, *(mean.lerp(draws, s) for s in stretches)])
-
-    @torch.no_grad()
-    def log_density() -> Tensor:
-        terms = [prior.log_prob(theta).double()]
-        for s in stretches:
-            log_prob = posterior.log_prob_batched(mean.lerp(theta, 1 / s), x).double()
-            terms.append(log_prob - math.log(s) * theta.shape[-1])
-        return torch.stack(terms).logsumexp(dim=0) - math.log(len(terms))
-
-    return theta, log_density

@@ -18,6 +18,7 @@ from sbi_rope.plots._samples import (
 )
 from sbi_rope.stacking import StackedPosterior
 from sbi_rope.utils.errors import InvalidInputError, warn_user
+from sbi_rope.utils.seeds import seeded
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -61,9 +62,14 @@ def credible_set(
             if not found:
                 raise
             warn_user(f"No set with a guarantee is drawn. {error}")
-    points = torch.cat([one.draws for one, _ in found.values()])
+    with seeded(0):
+        draws = posterior.sample((2000,), x, show_progress_bars=False)
+        # A guaranteed set may reach further than the posterior.
+        from_prior = posterior.prior.sample((2000,)).to(draws)
+    mean = draws.mean(dim=0)
+    points = torch.cat([from_prior, *(mean.lerp(draws, s) for s in (1.0, 2.0, 4.0))])
     samples = {name: points[one.contains(points)] for name, (one, _) in found.items()}
-    samples["posterior"] = next(iter(found.values()))[0].draws
+    samples["posterior"] = draws
     names = posterior.parameter_names if parameter_names is None else parameter_names
     members, truth, labels = as_samples(samples, theta, names)
     draws = members.pop("posterior")
@@ -80,7 +86,7 @@ def credible_set(
                 for value in end[:, pair[0]].tolist():
                     axes.axvline(value, **STYLES[name], lw=1.8, markevery=[])
             continue
-        for name in sorted(found, key=lambda name: -found[name][0].volume):
+        for name in sorted(found, key=lambda name: -len(members[name])):
             colour, columns = STYLES[name]["color"], members[name][:, pair].T.numpy()
             axes.scatter(*columns, s=5, color=colour, lw=0, rasterized=True)
     from matplotlib.lines import Line2D
