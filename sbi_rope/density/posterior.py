@@ -66,6 +66,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
     """
 
     prior: PriorDistribution
+    posterior_estimator: Density
     # One name for each parameter, and for each column of tables of x, if they have any.
     parameter_names: tuple[str, ...] | None = None
     x_names: tuple[str, ...] | None = None
@@ -251,8 +252,9 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             return density.draw(z, row)
 
         size = min(MAX_ENTRIES, max_sampling_batch_size or MAX_ENTRIES)
+        propose: Callable[[Tensor], Tensor] = draw
         if reject_outside_prior:
-            draw = rejecting(draw, self.prior.inside, num_rows, size)
+            propose = rejecting(draw, self.prior.inside, num_rows, size)
         theta = torch.empty(total, *density.input_shape, device=density.device)
         # Observation by observation, so that few of them are needed at a time.
         slots = torch.arange(total, device=theta.device).split(size)
@@ -263,7 +265,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         ):
             for slot in slots if total else ():
                 row, number = slot // num_samples, slot % num_samples
-                theta[number * num_rows + row] = draw(row)
+                theta[number * num_rows + row] = propose(row)
                 bar.update(len(slot))
         return theta.reshape(*shape, num_rows, *density.input_shape)
 
@@ -332,11 +334,10 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         The defaults are smaller than those of sbi, which would take many minutes:
         ``num_iter`` and ``num_init_samples`` are 100, and ``num_to_optimize`` is 5.
         """
-        own: dict[str, Any] = dict(
-            num_iter=100, num_init_samples=100, num_to_optimize=5
-        )
+        own = {"num_iter": 100, "num_init_samples": 100, "num_to_optimize": 5}
+        options = {**own, **options}
         with torch.enable_grad():  # the caller may have switched gradients off
-            return super().map(x=x, **(own | options))
+            return super().map(x=x, **options)
 
     # --- normalisation ---
 
@@ -400,12 +401,11 @@ def rejecting(
             is_slow &= inside < MIN_ACCEPTANCE * proposed
             further = (missing * proposed / (inside + PSEUDO_COUNT))[is_slow].sum()
             if proposed[is_slow].sum() >= MIN_PROPOSALS and further > MAX_PROPOSALS:
+                numbers = is_slow.nonzero().flatten()[:5].tolist()
                 raise SamplingError(
                     f"Less than one in {1 / MIN_ACCEPTANCE:g} draws lies inside the "
-                    "support of the prior for rows "
-                    f"{is_slow.nonzero().flatten()[:5].tolist()} of `x`. Leave these "
-                    "observations out, train NPE longer, or pass "
-                    "reject_outside_prior=False."
+                    f"support of the prior for rows {numbers} of `x`. Leave these out, "
+                    "train NPE longer, or pass reject_outside_prior=False."
                 )
         return theta
 

@@ -14,7 +14,7 @@ Each score is that of the posterior of fold k(i), which has not seen the pair:
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -225,14 +225,14 @@ class CredibleSet:
     Attributes:
         level: The level that was asked for.
         guarantee: The guarantee; None if there is none.
-        shape: The shape of parameters, ``(d,)``, or ``(B, d)`` of a batch.
+        like: A tensor of the shape of parameters, ``(d,)``, or ``(B, d)`` of a batch.
         rule: Tells which parameters ``(n, B, d)`` are in the sets, ``(n, B)``.
         parameter_names: One name for each parameter; None if they have none.
     """
 
     level: float
     guarantee: Guarantee | None
-    shape: tuple[int, ...]
+    like: Tensor
     rule: Callable[[Tensor], Tensor]
     parameter_names: tuple[str, ...] | None
 
@@ -242,12 +242,11 @@ class CredibleSet:
 
         For sets of a batch these are ``(*batch, B, d)`` and ``(*batch, B)``.
         """
-        rows, shape = _rows(theta, self.shape, self.parameter_names)
+        rows, shape = _rows(theta, self.like, self.parameter_names)
         return self.rule(rows.reshape(len(rows), -1, shape[-1])).reshape(shape[:-1])
 
     def __str__(self) -> str:
-        of = f"{100 * self.level:.4g}% set of {self.shape[-1]} parameter(s)."
-        return f"{of} {self.guarantee or NO_GUARANTEE}"
+        return f"{100 * self.level:.4g}% set. {self.guarantee or NO_GUARANTEE}"
 
     __repr__ = __str__  # which notebooks show
 
@@ -257,8 +256,7 @@ class CredibleIntervals:
     """An interval for each parameter given an observation, or each of a batch.
 
     ``posterior.credible_intervals`` makes it. Each interval has the level by itself, so
-    that all parameters together are inside less often. Of a batch, ``intervals[i]`` are
-    those of one observation.
+    that all parameters together are inside less often.
 
     Attributes:
         level: The level of each interval.
@@ -274,34 +272,25 @@ class CredibleIntervals:
     high: Tensor
     parameter_names: tuple[str, ...] | None
 
-    def __getitem__(self, index: int | slice) -> "CredibleIntervals":
-        """Return the intervals of one observation of a batch, or of several."""
-        return replace(self, low=self.low[index], high=self.high[index])
-
     def contains(self, theta: Tensor) -> Tensor:
         """Tell which parameters are in their intervals, one by one.
 
         They have the shape ``(*batch, d)``, or ``(*batch, B, d)`` for intervals of a
         batch, and so has the result.
         """
-        rows, shape = _rows(theta, self.low.shape, self.parameter_names)
-        rows = rows.to(self.low)
+        rows, shape = _rows(theta, self.low, self.parameter_names)
         return ((self.low <= rows) & (rows <= self.high)).reshape(shape)
 
     def as_rows(self) -> list[dict[str, Any]]:
-        """Return a row for each parameter: its name, and the ends of its interval.
-
-        The rows of a batch also hold the number of the observation, from 0.
-        """
-        if self.low.ndim > 1:
-            return [
-                {"observation": number, **row}
-                for number in range(len(self.low))
-                for row in self[number].as_rows()
-            ]
-        names = self.parameter_names or default_names(len(self.low))
-        ends = zip(names, self.low.tolist(), self.high.tolist(), strict=True)
-        return [{"parameter": name, "low": a, "high": b} for name, a, b in ends]
+        """Return a row for each parameter of each observation: its interval."""
+        width = self.low.shape[-1]
+        names = self.parameter_names or default_names(width)
+        ends = torch.stack([self.low, self.high], dim=-1).reshape(-1, width, 2).tolist()
+        return [
+            {"observation": number, "parameter": name, "low": low, "high": high}
+            for number, of_one in enumerate(ends)
+            for name, (low, high) in zip(names, of_one, strict=True)
+        ]
 
     def __str__(self) -> str:
         lines, rows = (
@@ -309,24 +298,25 @@ class CredibleIntervals:
             self.as_rows(),
         )
         for row in rows[:MAX_PRINTED]:
-            of = f" observation {row['observation']}," if "observation" in row else ""
+            number = f"observation {row['observation']}, " * (self.low.ndim > 1)
             ends = f"{row['low']:.6g} to {row['high']:.6g}"
-            lines.append(f" {of} {row['parameter']}: {ends}")
+            lines.append(f"  {number}{row['parameter']}: {ends}")
         if len(rows) > MAX_PRINTED:
             lines.append(f"  and {len(rows) - MAX_PRINTED} more")
-        promise = f"{self.guarantee or NO_GUARANTEE}"
-        lines.append(f"{promise} All parameters together are inside less often.")
+        lines.append(str(self.guarantee or NO_GUARANTEE))
+        if self.low.shape[-1] > 1:
+            lines.append("All parameters together are inside less often.")
         return "\n".join(lines)
 
     __repr__ = __str__  # which notebooks show
 
 
-def _rows(theta: Any, shape: Sequence[int], names: Any) -> tuple[Tensor, torch.Size]:
-    """Return parameters as ``(n, *shape)``, and the shape that they had."""
+def _rows(theta: Any, like: Tensor, names: Any) -> tuple[Tensor, torch.Size]:
+    """Return parameters as ``(n, *like.shape)``, and the shape that they had."""
     theta = as_numbers("theta", theta, names=names)
-    given, count = theta.shape, len(shape)
-    rows = theta if theta.ndim > count else theta[None]
-    return as_batch("theta", rows.flatten(0, rows.ndim - count - 1), shape), given
+    rows = theta if theta.ndim > like.ndim else theta[None]
+    rows = rows.flatten(0, max(0, rows.ndim - like.ndim - 1))
+    return as_batch("theta", rows, like.shape).to(like), theta.shape
 
 
 class MakesSets:
@@ -375,30 +365,30 @@ class MakesSets:
             if guaranteed:
                 pairs, stacks = self._held_out()
                 guarantee, rank = pairs.guarantee(level), rank_needed(level, len(pairs))
-                of_draws = [
-                    _log_prob(one, _draw(one, pairs.num_draws, x), x) for one in stacks
+                of_stacks = [
+                    (one, _log_prob(one, _draw(one, pairs.num_draws, x), x))
+                    for one in stacks
                 ]
-                scores = pairs.joint.to(x.device)
+
+                def rule(theta: Tensor) -> Tensor:
+                    at_theta = torch.stack(
+                        [joint_scores(_log_prob(q, theta, x), d) for q, d in of_stacks]
+                    )
+                    scores = pairs.joint.to(at_theta)
+                    held = is_held(scores, pairs.fold, at_theta, rank=rank).T
+                    return held & self.prior.inside(theta.flatten(0, 1)).view_as(held)
             else:
                 log_prob = _log_prob(self, _draw(self, num_samples, x), x)
                 number = num_samples + 1 - _round_up(level * num_samples)
                 least = log_prob.kthvalue(number, keepdim=True).values
 
-        def rule(theta: Tensor) -> Tensor:
-            theta = theta.to(x)
-            if guarantee is None:
-                return (_log_prob(self, theta, x) >= least).T
-            at_theta = [
-                joint_scores(_log_prob(one, theta, x), draws)
-                for one, draws in zip(stacks, of_draws, strict=True)
-            ]
-            held = is_held(scores, pairs.fold, torch.stack(at_theta), rank=rank).T
-            return held & self.prior.inside(theta.flatten(0, 1)).reshape(held.shape)
+                def rule(theta: Tensor) -> Tensor:
+                    return (_log_prob(self, theta, x) >= least).T
 
         return CredibleSet(
             level=level,
             guarantee=guarantee,
-            shape=shape,
+            like=x.new_empty(shape),
             rule=rule,
             parameter_names=self.parameter_names,
         )

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from sbi_rope import CalibrationFinetuner, RoPE, diagnose, stack
 from sbi_rope.baselines import CalibrationMLP, FinetunedNPE, Training
-from sbi_rope.density import average
+from sbi_rope.density import MixturePosterior, density_of
 from sbi_rope.methods import DiscrepancyNPE
 from sbi_rope.npe.standardisation import deviations
 from sbi_rope.utils.errors import InvalidInputError, RoPEWarning
@@ -116,7 +116,7 @@ def test_x_that_is_too_long_without_a_net_is_refused_before_training() -> None:
 
 
 def test_an_amortised_posterior_warns_of_an_observation_in_another_unit() -> None:
-    posterior = average([npe_of("independent"), npe_of("independent")])
+    posterior = MixturePosterior(density_of(npe_of("independent")), PRIOR)
     x = simulator(THETA[:3])
     other = x * torch.tensor([1000.0, 1000.0, 1.0])
     with pytest.warns(RoPEWarning, match=r"\(first: \[0, 1\]\).*Check the units"):

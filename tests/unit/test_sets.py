@@ -58,11 +58,6 @@ def test_sets_of_gaussians_are_ellipsoids(level: float) -> None:
     ring = torch.stack([angle.cos(), angle.sin()], dim=2) * radius
     assert found.contains(gaussian.GAIN * x + 0.97 * ring).all()
     assert not found.contains(gaussian.GAIN * x + 1.03 * ring).any()
-    area = math.pi * radius**2
-    assert (abs(found.volume - area) < 4 * found.volume_error + 0.02 * area).all()
-    assert (found.volume_error < 0.02 * area).all()
-    share = found.contains(found.draws).double().mean(dim=0)
-    assert share.tolist() == pytest.approx([level] * 3)
 
 
 def test_a_set_ends_at_the_support_of_the_prior() -> None:
@@ -71,8 +66,6 @@ def test_a_set_ends_at_the_support_of_the_prior() -> None:
     inside = found.contains(torch.tensor([[0.4, -0.8], [0.4, -1.01], [1.01, -0.8]]))
     assert inside.tolist() == [True, False, False]
     assert posterior.credible_intervals(0.99, X, seed=0).low[1] > -1.0
-    # With standard deviations of 1 / sqrt(3).
-    assert float(found.volume_z) == pytest.approx(3 * float(found.volume), rel=1e-5)
 
 
 def test_intervals_of_gaussians_are_central() -> None:
@@ -83,7 +76,6 @@ def test_intervals_of_gaussians_are_central() -> None:
     assert torch.allclose(found.high, gaussian.GAIN * x + reach, atol=0.02)
     row = {"parameter": "theta_2", "low": found.low[1, 1], "high": found.high[1, 1]}
     assert found.as_rows()[3] == {"observation": 1, **row}
-    assert found[1].as_rows()[1] == row
     assert "observation 1, theta_2: " in str(found)
 
 
@@ -93,9 +85,6 @@ def test_shapes_are_those_of_one_observation_or_of_a_batch() -> None:
         event = X.shape if x is None else x.shape
         found = posterior.credible_set(x=x, seed=0)
         intervals = posterior.credible_intervals(x=x, seed=0)
-        assert found.volume.shape == event[:-1]
-        assert torch.equal(found.volume, posterior.credible_set(x=x, seed=0).volume)
-        assert "volume" in str(found)
         assert intervals.contains(torch.stack([intervals.low, intervals.high])).all()
         assert not intervals.contains(intervals.high + 0.01).any()
         for shape in ((), (3,), (2, 3)):
@@ -171,7 +160,7 @@ class Wrong(MakesSets):
     """N(0.8 x + shift, std), the stack or the stack of a fold."""
 
     prior = PriorDistribution(gaussian.prior(1))
-    posterior_estimator = SimpleNamespace(condition_shape=(1,), modules=list)
+    posterior_estimator = SimpleNamespace(condition_shape=(1,), input_shape=(1,))
     parameter_names = None
 
     def __init__(self, shift: float, std: float, held_out: Any = None) -> None:
@@ -262,8 +251,6 @@ def test_guaranteed_sets_of_a_batch_are_those_of_counting_at_each_observation(
     found = stack.credible_set(0.8, x, guaranteed=True, seed=0)
     scores, folds = stack._held_out()
     with seeded(0):
-        stack.sample_batched((250,), x, **stacks.QUIET)  # for the volume
-        stack.prior.sample((250, 3))
         draws = [one.sample_batched((40,), x, **stacks.QUIET) for one in folds]
     theta = 2.2 * torch.rand(400, 3, 2) - 1.1
     held = found.contains(theta)
@@ -275,8 +262,6 @@ def test_guaranteed_sets_of_a_batch_are_those_of_counting_at_each_observation(
         pairs = scores.joint, scores.fold, torch.stack(at_theta)
         assert torch.equal(held[:, i], held_by_counting(*pairs, 0.8))
     assert not held[(theta.abs() > 1).any(dim=2)].any()
-    box = held.double().mean(dim=0) * 2.2**2
-    assert ((found.volume - box).abs() < 4 * found.volume_error + 0.4).all()
 
 
 def test_guaranteed_intervals_of_a_batch_are_those_of_each_observation(
@@ -339,7 +324,8 @@ def test_sets_of_mixed_parameters_hold_categories_only() -> None:
     rope = stacks.rope_of(pairs, family="mnpe")
     posterior = stacks.stacked(rope, candidates=[stacks.PRIOR, stacks.NPE])
     found = posterior.credible_set(0.9, pairs[1][0], guaranteed=True, seed=0)
-    assert math.isfinite(found.volume)
-    members = found.draws[found.contains(found.draws)][:, 2:]
+    members = prior.sample((500,))
+    members = members[found.contains(members)]
     assert len(members)
-    assert torch.equal(members, members.round())
+    members[:, 2:] += 0.5
+    assert not found.contains(members).any()
