@@ -218,21 +218,26 @@ class SetScores:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CredibleSet:
-    """A set of parameters that are credible given an observation, or each of a batch.
+    """What is credible given an observation, or each of a batch.
 
-    ``posterior.credible_set`` makes it.
+    ``posterior.credible_set`` makes it. It is a set of all parameters together, and an
+    interval of each. Every interval has the level by itself, so that all parameters
+    are in their intervals less often.
 
     Attributes:
         level: The level that was asked for.
-        guarantee: The guarantee; None if there is none.
-        like: A tensor of the shape of parameters, ``(d,)``, or ``(B, d)`` of a batch.
+        guarantee: The guarantee, of the set and of each interval; None if there is
+            none.
+        low: The lower ends of the intervals, shape ``(d,)``, or ``(B, d)`` of a batch.
+        high: The upper ends, as ``low``.
         rule: Tells which parameters ``(n, B, d)`` are in the sets, ``(n, B)``.
         parameter_names: One name for each parameter; None if they have none.
     """
 
     level: float
     guarantee: Guarantee | None
-    like: Tensor
+    low: Tensor
+    high: Tensor
     rule: Callable[[Tensor], Tensor]
     parameter_names: tuple[str, ...] | None
 
@@ -242,47 +247,24 @@ class CredibleSet:
 
         For sets of a batch these are ``(*batch, B, d)`` and ``(*batch, B)``.
         """
-        rows, shape = _rows(theta, self.like, self.parameter_names)
+        rows, shape = self._rows(theta)
         return self.rule(rows.reshape(len(rows), -1, shape[-1])).reshape(shape[:-1])
 
-    def __str__(self) -> str:
-        return f"{100 * self.level:.4g}% set. {self.guarantee or NO_GUARANTEE}"
-
-    __repr__ = __str__  # which notebooks show
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class CredibleIntervals:
-    """An interval for each parameter given an observation, or each of a batch.
-
-    ``posterior.credible_intervals`` makes it. Each interval has the level by itself, so
-    that all parameters together are inside less often.
-
-    Attributes:
-        level: The level of each interval.
-        guarantee: The guarantee of each interval; None if there is none.
-        low: The lower ends, shape ``(d,)``, or ``(B, d)`` of a batch.
-        high: The upper ends, as ``low``.
-        parameter_names: One name for each parameter; None if they have none.
-    """
-
-    level: float
-    guarantee: Guarantee | None
-    low: Tensor
-    high: Tensor
-    parameter_names: tuple[str, ...] | None
-
-    def contains(self, theta: Tensor) -> Tensor:
-        """Tell which parameters are in their intervals, one by one.
-
-        They have the shape ``(*batch, d)``, or ``(*batch, B, d)`` for intervals of a
-        batch, and so has the result.
-        """
-        rows, shape = _rows(theta, self.low, self.parameter_names)
+    def contains_each(self, theta: Tensor) -> Tensor:
+        """Tell which parameters are in their intervals, one by one, as theta."""
+        rows, shape = self._rows(theta)
         return ((self.low <= rows) & (rows <= self.high)).reshape(shape)
 
+    def _rows(self, theta: Any) -> tuple[Tensor, torch.Size]:
+        """Return parameters as ``(n, *low.shape)``, and the shape that they had."""
+        theta = as_numbers("theta", theta, names=self.parameter_names)
+        count = max(1, theta.ndim - self.low.ndim)
+        rows = theta if theta.ndim > self.low.ndim else theta[None]
+        rows = as_batch("theta", rows.flatten(0, count - 1), self.low.shape)
+        return rows.to(self.low), theta.shape
+
     def as_rows(self) -> list[dict[str, Any]]:
-        """Return a row for each parameter of each observation: its interval."""
+        """Return a row for each parameter of each observation, with its interval."""
         width = self.low.shape[-1]
         names = self.parameter_names or default_names(width)
         ends = torch.stack([self.low, self.high], dim=-1).reshape(-1, width, 2).tolist()
@@ -293,30 +275,19 @@ class CredibleIntervals:
         ]
 
     def __str__(self) -> str:
-        lines, rows = (
-            [f"{100 * self.level:.4g}% intervals, one by one:"],
-            self.as_rows(),
-        )
+        lines = [f"{100 * self.level:.4g}% intervals of each parameter by itself:"]
+        rows = self.as_rows()
         for row in rows[:MAX_PRINTED]:
             number = f"observation {row['observation']}, " * (self.low.ndim > 1)
             ends = f"{row['low']:.6g} to {row['high']:.6g}"
             lines.append(f"  {number}{row['parameter']}: {ends}")
         if len(rows) > MAX_PRINTED:
             lines.append(f"  and {len(rows) - MAX_PRINTED} more")
-        lines.append(str(self.guarantee or NO_GUARANTEE))
         if self.low.shape[-1] > 1:
             lines.append("All parameters together are inside less often.")
-        return "\n".join(lines)
+        return "\n".join([*lines, str(self.guarantee or NO_GUARANTEE)])
 
     __repr__ = __str__  # which notebooks show
-
-
-def _rows(theta: Any, like: Tensor, names: Any) -> tuple[Tensor, torch.Size]:
-    """Return parameters as ``(n, *like.shape)``, and the shape that they had."""
-    theta = as_numbers("theta", theta, names=names)
-    rows = theta if theta.ndim > like.ndim else theta[None]
-    rows = rows.flatten(0, max(0, rows.ndim - like.ndim - 1))
-    return as_batch("theta", rows, like.shape).to(like), theta.shape
 
 
 class MakesSets:
@@ -325,113 +296,55 @@ class MakesSets:
     def credible_set(
         self: Any,
         level: float = 0.9,
-        x: Tensor | None = None,
+        x: Any = None,
         *,
         guaranteed: bool = False,
         num_samples: int = 1000,
         seed: int | None = None,
     ) -> CredibleSet:
-        r"""Return a set that is credible given an observation, or each of a batch.
+        r"""Return a set and intervals that are credible given x, or each of a batch.
 
-        It is the set of highest density,
+        The set is that of highest density,
         :math:`\{\theta: \log p(\theta \mid x) \ge t\}`, with t the (1 - level)
-        quantile of the log density of draws. It holds the true parameters with
-        the probability ``level`` only if the posterior is calibrated. With
-        ``guaranteed``, a stack corrects it by its out-of-fold scores, see
-        :class:`~sbi_rope.density.sets.Guarantee`.
+        quantile of the log density of draws, and the intervals are the central ones of
+        draws. They hold the true parameters with the probability ``level`` only if the
+        posterior is calibrated. With ``guaranteed``, a stack corrects them by its
+        out-of-fold scores, see :class:`~sbi_rope.density.sets.Guarantee`.
 
         Args:
-            level: The probability of the set.
+            level: The probability of the set, and of each interval by itself.
             x: An observation ``(*event)``, or a batch ``(B, *event)``, from the batch
                 of the posterior if there is one; the default x if None.
-            guaranteed: Whether the set shall hold the true parameters in about
-                ``level`` of the cases, even if the posterior is not calibrated. This
-                needs a stack, and observations drawn as its calibration pairs.
-            num_samples: The number of draws, of which at least one has to be outside
-                the set. With ``guaranteed`` there are as many as the stack was scored
-                with.
+            guaranteed: Whether they shall hold the true parameters in about ``level``
+                of the cases, even if the posterior is not calibrated. This needs a
+                stack, and observations drawn as its calibration pairs.
+            num_samples: The number of draws, of which some have to be outside. With
+                ``guaranteed`` there are as many as the stack was scored with.
             seed: Seed of the draws; None uses the states of torch, NumPy and Python.
 
-        Returns:
-            The set, which tells which parameters it contains.
-
         Raises:
-            InvalidInputError: With ``guaranteed``, if this is no stack, or if it has
-                too few pairs.
+            InvalidInputError: If there are too few draws for the level. With
+                ``guaranteed``, if this is no stack, or if it has too few pairs.
+            LogProbUnavailableError: If ``contains`` is called without a density.
         """
-        x, shape = _checked(self, level, x, num_samples, 0 if guaranteed else 1)
-        guarantee = None
+        check("level", level, Level)
+        check("num_samples", num_samples, Count)
+        density = self.posterior_estimator
+        shape: tuple[int, ...] = tuple(density.input_shape)
+        if x is None or np.ndim(x) == len(density.condition_shape):
+            x = self._one_x(x)
+        else:
+            x = self._batch_of_x(x)
+            shape = (len(x), *shape)
+        make = _guaranteed if guaranteed else _of_draws
         with seeded(seed), torch.no_grad():
-            if guaranteed:
-                pairs, stacks = self._held_out()
-                guarantee, rank = pairs.guarantee(level), rank_needed(level, len(pairs))
-                of_stacks = [
-                    (one, _log_prob(one, _draw(one, pairs.num_draws, x), x))
-                    for one in stacks
-                ]
-
-                def rule(theta: Tensor) -> Tensor:
-                    at_theta = torch.stack(
-                        [joint_scores(_log_prob(q, theta, x), d) for q, d in of_stacks]
-                    )
-                    scores = pairs.joint.to(at_theta)
-                    held = is_held(scores, pairs.fold, at_theta, rank=rank).T
-                    return held & self.prior.inside(theta.flatten(0, 1)).view_as(held)
-            else:
-                log_prob = _log_prob(self, _draw(self, num_samples, x), x)
-                number = num_samples + 1 - _round_up(level * num_samples)
-                least = log_prob.kthvalue(number, keepdim=True).values
-
-                def rule(theta: Tensor) -> Tensor:
-                    return (_log_prob(self, theta, x) >= least).T
-
+            guarantee, low, high, rule = make(self, level, x, num_samples)
         return CredibleSet(
-            level=level,
-            guarantee=guarantee,
-            like=x.new_empty(shape),
-            rule=rule,
-            parameter_names=self.parameter_names,
-        )
-
-    def credible_intervals(
-        self: Any,
-        level: float = 0.9,
-        x: Tensor | None = None,
-        *,
-        guaranteed: bool = False,
-        num_samples: int = 1000,
-        seed: int | None = None,
-    ) -> CredibleIntervals:
-        """Return an interval for each parameter given an observation, or each of B.
-
-        It is the central interval of draws, of which at least one has to be beyond each
-        end. Arguments and errors are those of :meth:`credible_set`. The ends have the
-        shape ``(d,)``, or ``(B, d)`` of a batch.
-        """
-        x, shape = _checked(self, level, x, num_samples, 0 if guaranteed else 2)
-        guarantee, of_folds = None, []
-        with seeded(seed), torch.no_grad():
-            if guaranteed:
-                pairs, stacks = self._held_out()
-                guarantee, rank = pairs.guarantee(level), rank_needed(level, len(pairs))
-                for number, stack in enumerate(stacks):
-                    draws = _draw(stack, pairs.num_draws, x).permute(1, 2, 0)
-                    scores = pairs.marginal[pairs.fold == number].T.to(draws.device)
-                    of_folds.append(marginal_ends(scores.expand(len(x), -1, -1), draws))
-                low, high = torch.cat(of_folds, dim=-1)
-                low = low.kthvalue(len(pairs) + 1 - rank).values
-                high = high.kthvalue(rank).values
-                least, most = self.prior.bounds(low)
-                low, high = low.clamp(least, most), high.clamp(least, most)
-            else:
-                draws = _draw(self, num_samples, x).double().cpu().numpy()
-                tails = (1 - level) / 2, (1 + level) / 2
-                low, high = map(torch.from_numpy, np.quantile(draws, tails, axis=0))
-        return CredibleIntervals(
             level=level,
             guarantee=guarantee,
             low=low.to(x).reshape(shape),
             high=high.to(x).reshape(shape),
+            rule=rule,
             parameter_names=self.parameter_names,
         )
 
@@ -443,22 +356,50 @@ class MakesSets:
         )
 
 
-def _checked(
-    posterior: Any, level: Any, x: Any, num_samples: Any, num_ends: int
-) -> tuple[Tensor, tuple[int, ...]]:
-    """Return observations ``(B, *event)``, and the shape of parameters they are for."""
-    check("level", level, Level)
-    check("num_samples", num_samples, Count)
-    if num_samples < (needed := _round_up(num_ends / (1 - level))):
+def _of_draws(posterior: Any, level: float, x: Tensor, num_samples: int) -> Any:
+    """Return no guarantee, the ends of central intervals, and the rule of the set."""
+    if num_samples < (needed := _round_up(2 / (1 - level))):
         raise InvalidInputError(
             f"Expected `num_samples` of at least {needed} for a level of {level:g}, so "
             f"that a draw is beyond each end; got {num_samples}."
         )
-    density = posterior.posterior_estimator
-    if x is None or np.ndim(x) == len(density.condition_shape):
-        return posterior._one_x(x), tuple(density.input_shape)
-    x = posterior._batch_of_x(x)
-    return x, (len(x), *density.input_shape)
+    draws = _draw(posterior, num_samples, x)
+    tails = (1 - level) / 2, (1 + level) / 2
+    ends = np.quantile(draws.double().cpu().numpy(), tails, axis=0)
+
+    def rule(theta: Tensor) -> Tensor:
+        number = num_samples + 1 - _round_up(level * num_samples)
+        least = _log_prob(posterior, draws, x).kthvalue(number, keepdim=True).values
+        return (_log_prob(posterior, theta, x) >= least).T
+
+    return None, *map(torch.from_numpy, ends), rule
+
+
+def _guaranteed(posterior: Any, level: float, x: Tensor, num_samples: int) -> Any:
+    """Return the guarantee, the ends of intervals, and the rule of the set."""
+    pairs, stacks = posterior._held_out()
+    guarantee, rank = pairs.guarantee(level), rank_needed(level, len(pairs))
+    draws = [_draw(one, pairs.num_draws, x) for one in stacks]
+    of_folds = []
+    for number, own in enumerate(draws):
+        scores = pairs.marginal[pairs.fold == number].T.to(own.device)
+        scores = scores.expand(len(x), -1, -1)
+        of_folds.append(marginal_ends(scores, own.permute(1, 2, 0)))
+    low, high = torch.cat(of_folds, dim=-1)
+    low = low.kthvalue(len(pairs) + 1 - rank).values
+    high = high.kthvalue(rank).values
+    least, most = posterior.prior.bounds(low)
+
+    def rule(theta: Tensor) -> Tensor:
+        at_theta = [
+            joint_scores(_log_prob(one, theta, x), _log_prob(one, own, x))
+            for one, own in zip(stacks, draws, strict=True)
+        ]
+        scores = pairs.joint.to(x.device)
+        held = is_held(scores, pairs.fold, torch.stack(at_theta), rank=rank).T
+        return held & posterior.prior.inside(theta.flatten(0, 1)).view_as(held)
+
+    return guarantee, low.clamp(least, most), high.clamp(least, most), rule
 
 
 def _draw(posterior: Any, num_samples: int, x: Tensor) -> Tensor:

@@ -54,10 +54,10 @@ def credible_set(
     x = posterior._one_x(x)[0]
     found = {}
     for name in list(STYLES)[: 1 + isinstance(posterior, StackedPosterior)]:
-        options: dict[str, Any] = {"guaranteed": bool(found), "num_samples": 2000}
-        makers = posterior.credible_set, posterior.credible_intervals
         try:
-            found[name] = [make(level, x, seed=0, **options) for make in makers]
+            found[name] = posterior.credible_set(
+                level, x, guaranteed=bool(found), num_samples=2000, seed=0
+            )
         except InvalidInputError as error:
             if not found:
                 raise
@@ -68,12 +68,12 @@ def credible_set(
         from_prior = posterior.prior.sample((2000,)).to(draws)
     mean = draws.mean(dim=0)
     points = torch.cat([from_prior, *(mean.lerp(draws, s) for s in (1.0, 2.0, 4.0))])
-    samples = {name: points[one.contains(points)] for name, (one, _) in found.items()}
+    samples = {name: points[one.contains(points)] for name, one in found.items()}
     samples["posterior"] = draws
     names = posterior.parameter_names if parameter_names is None else parameter_names
     members, truth, labels = as_samples(samples, theta, names)
     draws = members.pop("posterior")
-    ends = {name: torch.stack([b.low, b.high]) for name, (_, b) in found.items()}
+    ends = {name: torch.stack([one.low, one.high]) for name, one in found.items()}
     shown = [central_interval(draws), *members.values(), *ends.values()]
     shown += [] if truth is None else [truth[None]]
     shown = torch.cat([one.to(draws) for one in shown]).nan_to_num(posinf=0, neginf=0)

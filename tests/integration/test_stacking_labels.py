@@ -85,8 +85,8 @@ def test_exact_labels_among_others_give_sets_with_a_guarantee(tmp_path: Path) ->
     assert torch.isfinite(scores.joint).all()
     x = observed()[:1]
     save(posterior, tmp_path / "stack")
-    again = load(tmp_path / "stack").credible_intervals(0.8, x, guaranteed=True, seed=0)
-    expected = posterior.credible_intervals(0.8, x, guaranteed=True, seed=0)
+    again = load(tmp_path / "stack").credible_set(0.8, x, guaranteed=True, seed=0)
+    expected = posterior.credible_set(0.8, x, guaranteed=True, seed=0)
     assert torch.equal(again.low, expected.low)
     with pytest.raises(InvalidInputError, match="8 exact labels"):
         posterior.credible_set(0.9, x, guaranteed=True)

@@ -1,7 +1,6 @@
 """Credible sets: closed forms, the arithmetic of the guarantee, and its coverage."""
 
 import copy
-import itertools
 import math
 from dataclasses import replace
 from types import SimpleNamespace
@@ -65,12 +64,12 @@ def test_a_set_ends_at_the_support_of_the_prior() -> None:
     found = posterior.credible_set(0.99, X, seed=0)
     inside = found.contains(torch.tensor([[0.4, -0.8], [0.4, -1.01], [1.01, -0.8]]))
     assert inside.tolist() == [True, False, False]
-    assert posterior.credible_intervals(0.99, X, seed=0).low[1] > -1.0
+    assert found.low[1] > -1.0
 
 
 def test_intervals_of_gaussians_are_central() -> None:
     x = torch.stack([X, -X])
-    found = exact().credible_intervals(0.9, x, num_samples=50_000, seed=0)
+    found = exact().credible_set(0.9, x, num_samples=50_000, seed=0)
     reach = 1.645 * gaussian.POSTERIOR_STD
     assert torch.allclose(found.low, gaussian.GAIN * x - reach, atol=0.02)
     assert torch.allclose(found.high, gaussian.GAIN * x + reach, atol=0.02)
@@ -84,13 +83,12 @@ def test_shapes_are_those_of_one_observation_or_of_a_batch() -> None:
     for x in (None, X, X[None], X.expand(3, 2)):
         event = X.shape if x is None else x.shape
         found = posterior.credible_set(x=x, seed=0)
-        intervals = posterior.credible_intervals(x=x, seed=0)
-        assert intervals.contains(torch.stack([intervals.low, intervals.high])).all()
-        assert not intervals.contains(intervals.high + 0.01).any()
+        assert found.contains_each(torch.stack([found.low, found.high])).all()
+        assert not found.contains_each(found.high + 0.01).any()
         for shape in ((), (3,), (2, 3)):
             theta = torch.zeros(*shape, *event)
             assert found.contains(theta).shape == (*shape, *event[:-1])
-            assert intervals.contains(theta).shape == theta.shape
+            assert found.contains_each(theta).shape == theta.shape
 
 
 # --- the arithmetic of the guarantee ---
@@ -207,8 +205,8 @@ def test_guaranteed_sets_cover_as_promised_whatever_the_posterior_is(
         pairs = SetScores(joint=joint, marginal=marginal, fold=fold, **numbers)
         posterior = Wrong(shift, std, (pairs, folds))
         sets = [posterior.credible_set(0.9, x[n:], guaranteed=g) for g in (True, False)]
-        intervals = posterior.credible_intervals(0.9, x[n:], guaranteed=True)
-        covered.append([one.contains(theta[n:]) for one in (*sets, intervals)])
+        of_each = sets[0].contains_each(theta[n:])
+        covered.append([*(one.contains(theta[n:]) for one in sets), of_each])
     of_sets, plain, of_intervals = (
         float(torch.cat(one).double().mean()) for one in zip(*covered, strict=True)
     )
@@ -244,16 +242,17 @@ def test_scores_of_pairs_are_those_of_stacks_that_have_not_seen_them(
         assert (scores.marginal[rows] - again).abs().max() < 0.4
 
 
-def test_guaranteed_sets_of_a_batch_are_those_of_counting_at_each_observation(
+def test_guaranteed_sets_of_a_batch_are_those_of_each_observation(
     stack: StackedPosterior,
 ) -> None:
-    x = stacks.observed()[:3]
+    x = stacks.observed()[0] + torch.tensor([1.0, 0.0, -1.0])[:, None]
     found = stack.credible_set(0.8, x, guaranteed=True, seed=0)
     scores, folds = stack._held_out()
     with seeded(0):
         draws = [one.sample_batched((40,), x, **stacks.QUIET) for one in folds]
     theta = 2.2 * torch.rand(400, 3, 2) - 1.1
     held = found.contains(theta)
+    assert not held[(theta.abs() > 1).any(dim=2)].any()
     for i in range(3):
         at_theta = [
             joint_scores(one.log_prob(theta[:, i], x[i]), one.log_prob(own[:, i], x[i]))
@@ -261,46 +260,33 @@ def test_guaranteed_sets_of_a_batch_are_those_of_counting_at_each_observation(
         ]
         pairs = scores.joint, scores.fold, torch.stack(at_theta)
         assert torch.equal(held[:, i], held_by_counting(*pairs, 0.8))
-    assert not held[(theta.abs() > 1).any(dim=2)].any()
+        for parameter in range(2):
+            ends = [
+                marginal_ends(score[[parameter]], draws[fold][:, i, parameter])
+                for score, fold in zip(
+                    scores.marginal, scores.fold.tolist(), strict=True
+                )
+            ]
+            # Of 20 pairs, 80 % of 21 are 16.8, so that the 17th counts.
+            low = sorted(float(end[0]) for end in ends)[-17]
+            high = sorted(float(end[1]) for end in ends)[16]
+            assert float(found.low[i, parameter]) == pytest.approx(max(low, -1))
+            assert float(found.high[i, parameter]) == pytest.approx(min(high, 1))
 
 
-def test_guaranteed_intervals_of_a_batch_are_those_of_each_observation(
-    stack: StackedPosterior,
-) -> None:
-    x = stacks.observed()[0] + torch.tensor([1.0, 0.0, -1.0])[:, None]
-    found = stack.credible_intervals(0.8, x, guaranteed=True, seed=0)
-    scores, folds = stack._held_out()
-    with seeded(0):
-        draws = [one.sample_batched((40,), x, **stacks.QUIET) for one in folds]
-    for number, parameter in itertools.product(range(3), range(2)):
-        ends = [
-            marginal_ends(score[[parameter]], draws[fold][:, number, parameter])
-            for score, fold in zip(scores.marginal, scores.fold.tolist(), strict=True)
-        ]
-        # Of 20 pairs, 80 % of 21 are 16.8, so that the 17th counts.
-        low = sorted(float(end[0]) for end in ends)[-17]
-        high = sorted(float(end[1]) for end in ends)[16]
-        assert float(found.low[number, parameter]) == pytest.approx(max(low, -1))
-        assert float(found.high[number, parameter]) == pytest.approx(min(high, 1))
-
-
-@pytest.mark.parametrize("name", ["credible_set", "credible_intervals"])
-def test_a_promise_is_what_draws_or_pairs_can_give(
-    stack: StackedPosterior, name: str
-) -> None:
-    x, call, of_npe = stacks.observed()[0], getattr(stack, name), getattr(exact(), name)
-    assert "no guarantee" in str(call(0.9, x, seed=0))
-    promised = call(0.95, x, guaranteed=True, num_samples=10)
+def test_a_promise_is_what_draws_or_pairs_can_give(stack: StackedPosterior) -> None:
+    x, of_npe = stacks.observed()[0], exact().credible_set
+    assert "no guarantee" in str(stack.credible_set(0.9, x, seed=0))
+    promised = stack.credible_set(0.95, x, guaranteed=True, num_samples=10)
     assert "the 20 calibration pairs" in str(promised)
-    needed = 1000 if name == "credible_set" else 2000
-    of_npe(0.999, X, num_samples=needed)
-    with pytest.raises(InvalidInputError, match=f"at least {needed} for a level"):
-        of_npe(0.999, X, num_samples=needed - 1)
+    of_npe(0.999, X, num_samples=2000)
+    with pytest.raises(InvalidInputError, match="at least 2000 for a level"):
+        of_npe(0.999, X, num_samples=1999)
     with pytest.raises(InvalidInputError, match=r"stack\(rope\)"):
         of_npe(0.9, X, guaranteed=True)
     for level in (0.99, 0.4):
         with pytest.raises(InvalidInputError, match=rf"0\.5 to 0\.952.*got {level}"):
-            call(level, x, guaranteed=True)
+            stack.credible_set(level, x, guaranteed=True)
 
 
 def test_with_impossible_labels_a_set_is_the_support_of_the_prior(
