@@ -1,8 +1,6 @@
 """Credible sets: closed forms, the arithmetic of the guarantee, and its coverage."""
 
-import copy
 import math
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -287,31 +285,3 @@ def test_a_promise_is_what_draws_or_pairs_can_give(stack: StackedPosterior) -> N
     for level in (0.99, 0.4):
         with pytest.raises(InvalidInputError, match=rf"0\.5 to 0\.952.*got {level}"):
             stack.credible_set(level, x, guaranteed=True)
-
-
-def test_with_impossible_labels_a_set_is_the_support_of_the_prior(
-    stack: StackedPosterior,
-) -> None:
-    known, changed = stack.report, copy.copy(stack)
-    joint = known.set_scores.joint.clone()
-    joint[:2] = torch.inf  # of 20, where a level of 90 % allows for one
-    scores = replace(known.set_scores, joint=joint)
-    changed.report = replace(known, set_scores=scores)
-    found = changed.credible_set(0.9, stacks.observed()[0], guaranteed=True)
-    corners = torch.tensor([[0.99, -0.99], [1.01, 0.0]])
-    assert found.contains(corners).tolist() == [True, False]
-
-
-@pytest.mark.medium
-def test_sets_of_mixed_parameters_hold_categories_only() -> None:
-    prior = problems.mixed_prior(2)
-    theta = prior.sample((12,))
-    pairs = theta, problems.simulate(theta)
-    rope = stacks.rope_of(pairs, family="mnpe")
-    posterior = stacks.stacked(rope, candidates=[stacks.PRIOR, stacks.NPE])
-    found = posterior.credible_set(0.9, pairs[1][0], guaranteed=True, seed=0)
-    members = prior.sample((500,))
-    members = members[found.contains(members)]
-    assert len(members)
-    members[:, 2:] += 0.5
-    assert not found.contains(members).any()
