@@ -113,11 +113,10 @@ class Flow(Density):
 
     def __getitem__(self, numbers: Tensor | Sequence[int]) -> "Flow":
         """Return the average of copies of some of the flows; shared parts stay so."""
-        some = torch.as_tensor(numbers)
-        nets, densities = (
-            one[some] if len(one) > 1 else copy.deepcopy(one)
-            for one in (self.nets, self.densities)
-        )
+        some, nets, densities = torch.as_tensor(numbers), self.nets, self.densities
+        nets = nets[some] if len(nets) > 1 else copy.deepcopy(nets)
+        own = len(densities) == self.num_members
+        densities = densities[some] if own else copy.deepcopy(densities)
         weights = self.weights[some]
         return self._with(nets, densities, weights / weights.sum())
 

@@ -50,8 +50,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
 
     It has all methods of sbi's :class:`DirectPosterior` and works with sbi's
     diagnostics. That of RoPE belongs to a batch of observations, its ``x_o``. Others
-    are amortised and answer any x. Apart from arguments and result it needs some 150
-    MB.
+    are amortised and answer any x.
 
     References:
         | Addressing Misspecification in Simulation-based Inference through Data-driven

@@ -130,11 +130,10 @@ class Guarantee:
         \frac{1 - K/n}{K + 1} \Big\}, \qquad \alpha = 1 - \text{level},
 
     in theory, and of about the level in practice, on average over calibration sets and
-    observations. The theorem is for folds of equal size. It holds for the candidates of
-    a stack. The weights of the stack have seen the labels of a fold, which changes the
-    coverage by less than one per cent in simulations with 10 to 50 pairs. A set ends
-    where the support of the prior ends, and parameters beyond it are missed in
-    addition. :func:`sbi_rope.diagnose` tests if a batch is drawn as the pairs were.
+    observations. The theorem is for folds of equal size, and candidates of a stack. The
+    weights of the stack have seen the labels of a fold, which changes the coverage by
+    less than one per cent in simulations with 10 to 50 pairs. Parameters beyond the
+    support of the prior are missed in addition.
 
     References:
         | Predictive Inference with the Jackknife+ (Barber et al., 2021), theorem 4
