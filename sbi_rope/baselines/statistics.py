@@ -68,9 +68,9 @@ class OverDraws(Flow):
         super().__init__(
             Ensemble([net], embedded, ()),
             Ensemble([density], log_density, ()),
+            density.input_shape,
+            event_shape,
             torch.full((num_draws,), 1 / num_draws).double(),
-            input_shape=density.input_shape,
-            condition_shape=event_shape,
         )
 
     readable = Density.readable  # what is finite

@@ -3,7 +3,7 @@
 from sbi_rope.density.base import Density, Given, Prior
 from sbi_rope.density.coupled import Coupled, OverSimulations
 from sbi_rope.density.flow import Flow
-from sbi_rope.density.mixture import Mixture, average, density_of
+from sbi_rope.density.mixture import Mixture, density_of
 from sbi_rope.density.posterior import MixturePosterior, PriorPosterior
 from sbi_rope.density.regression import GaussianProcess
 
@@ -18,6 +18,5 @@ __all__ = [
     "OverSimulations",
     "Prior",
     "PriorPosterior",
-    "average",
     "density_of",
 ]

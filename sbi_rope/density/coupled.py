@@ -3,21 +3,13 @@
 import hashlib
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
 from sbi_rope.coupling import Coupling
-from sbi_rope.density.base import (
-    Accept,
-    Density,
-    batches,
-    num_fitting,
-    without_nan,
-    without_nan_gradients,
-)
+from sbi_rope.density.base import Accept, Density, batches, num_fitting, without_nan
 from sbi_rope.npe.sbi import ConditionalDensityEstimator, embed, readable
 from sbi_rope.npe.standardisation import warn_of_far_entries
 from sbi_rope.training.ensemble import drawn, log_density
@@ -64,11 +56,13 @@ class OverSimulations(Density):
         """Return the log density at theta ``(S, B, d)``, shape ``(S, B)``, float64."""
         size, blocks = num_fitting(len(self.simulated)), []
         for points, some in zip(theta.split(size, dim=1), z.split(size), strict=True):
-            row, column, log_weights = without_tail(self.rows(some), self.tail_mass)
+            kept, column, log_weights = without_tail(self.rows(some), self.tail_mass)
+            row, column = kept.nonzero()[:, 0], column[kept]
             log_q = []
             for part in points.split(num_fitting(len(row))):
-                log_terms = self._log_terms(part, row, column) + log_weights
-                log_q.append(_log_sum_exp(log_terms, row, len(some)))
+                log_terms = log_weights.repeat(len(part), 1, 1)
+                log_terms[:, kept] += self._log_terms(part, row, column)
+                log_q.append(log_terms.logsumexp(dim=2))
             blocks.append(torch.cat(log_q))
         return torch.cat(blocks, dim=1)
 
@@ -77,11 +71,9 @@ class OverSimulations(Density):
         log_terms = []
         for pairs in batches(torch.arange(len(theta) * len(row), device=theta.device)):
             sample, k = pairs // len(row), pairs % len(row)
-            points = without_nan_gradients(theta[sample, row[k]])
-            of_pairs = log_density(self.density, points, self.simulated[column[k]])
-            log_terms.append(of_pairs)
-        log_q = without_nan(torch.cat(log_terms)).double()
-        return log_q.reshape(len(theta), len(row))
+            points, simulated = theta[sample, row[k]], self.simulated[column[k]]
+            log_terms.append(log_density(self.density, points, simulated))
+        return without_nan(torch.cat(log_terms)).double().reshape(-1, len(row))
 
     @torch.no_grad()
     def draw(self, z: Tensor, row: Tensor) -> Tensor:
@@ -91,14 +83,14 @@ class OverSimulations(Density):
         for number, some in enumerate(used.split(size)):
             mine = place // size == number
             column[mine] = _chosen(self.rows(z[some]), place[mine] % size)
-        theta = [drawn(self.density, self.simulated[some]) for some in batches(column)]
-        return torch.cat(theta)
+        return torch.cat(
+            [drawn(self.density, self.simulated[k]) for k in batches(column)]
+        )
 
     def mass(self, z: Tensor, num_rows: int, accept: Accept, **options: Any) -> Tensor:
         """Estimate masses row by row, so that they are the same in any batch."""
         estimate = super().mass
-        rows = [estimate(one, 1, accept, **options) for one in z.split(1)]
-        return torch.cat(rows)
+        return torch.cat([estimate(one, 1, accept, **options) for one in z.split(1)])
 
 
 class Coupled(OverSimulations):
@@ -118,7 +110,7 @@ class Coupled(OverSimulations):
         density: :math:`q(\theta \mid s)`.
         simulated: :math:`h(x_s)`, shape ``(n_s, l)``.
         x_o: The real observations that were coupled, shape ``(n_o, *event)``.
-        net: The embedding net g of real observations, for unseen ones.
+        net: The embedding net g of real observations.
         coupling: The coupling of :math:`g(x_o)` with the simulations.
         unseen: What to do with an x outside the batch: ``"raise"`` an error, or
             ``"extend"`` the coupling by a row under the same potential.
@@ -141,22 +133,16 @@ class Coupled(OverSimulations):
         self.coupling = coupling
         self.unseen: Literal["raise", "extend"] = unseen
         self.register_buffer("x_o", x_o)
-        self._index: dict[bytes, int] = {}
-        for i, key in enumerate(_keys(x_o)):
-            self._index.setdefault(key, i)
-
-    @property
-    def coupled(self) -> list["Coupled"]:
-        """This density."""
-        return [self]
+        # Backwards, so that of equal observations the first is found.
+        self._index = {key: i for i, key in reversed([*enumerate(_keys(x_o))])}
 
     def embed(self, x: Tensor) -> Tensor:
         """Embed observations, ``(n, *event)`` to ``(n, l)``."""
         x = x.to(self.x_o)
-        found = [self._index.get(key, -1) for key in _keys(x)]
-        index = torch.tensor(found, dtype=torch.long, device=self.x_o.device)
-        z = self.coupling.real[index.clamp_min(0)]
-        new = index < 0
+        index = torch.tensor([self._index.get(key, -1) for key in _keys(x)]).to(
+            x.device
+        )
+        z, new = self.coupling.real[index.clamp_min(0)], index < 0
         if new.any():
             z[new] = self._extended(x[new])
         return z
@@ -169,10 +155,7 @@ class Coupled(OverSimulations):
             )
         warn_of_far_entries("x", x, self.net)
         z = embed(self.net, x).to(self.coupling.real)
-        smallest = min(
-            float((1 / self.rows(some).square().sum(dim=1)).min())
-            for some in z.split(num_fitting(len(self.simulated)))
-        )
+        smallest = float((1 / self.rows(z).square().sum(dim=1)).min())
         warn_user(
             f"Extended the coupling to {len(x)} unseen observation(s). The smallest "
             f"effective sample size is {smallest:.1f} of {len(self.simulated)} "
@@ -181,27 +164,12 @@ class Coupled(OverSimulations):
         return z
 
     def readable(self, x: Tensor) -> Tensor:
-        """Tell which observations are in the batch, or can be read by the net."""
-        known = [key in self._index for key in _keys(x.to(self.x_o))]
-        return torch.tensor(known, device=x.device) | readable(self.net, x)
+        """Tell which observations can be read by the net."""
+        return readable(self.net, x)
 
     def rows(self, z: Tensor) -> Tensor:
         """Return the weights of the simulations, ``(b, n_s)``; rows sum to one."""
         return self.coupling.rows(z)
-
-    def restricted_to(self, index: int) -> "Coupled":
-        """Return the same density for one observation of the batch alone."""
-        row = torch.tensor([index], device=self.x_o.device)
-        one = Coupled(
-            self.density,
-            self.simulated,
-            self.x_o[row],
-            self.net if self.unseen == "extend" else nn.Identity(),
-            replace(self.coupling, real=self.coupling.real[row]),
-            unseen=self.unseen,
-        )
-        one.tail_mass = self.tail_mass
-        return one
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:  # noqa: FBT001, FBT002
         # `to` calls this for each module, but a coupling is not a module.
@@ -211,23 +179,14 @@ class Coupled(OverSimulations):
 
 
 def without_tail(weights: Tensor, tail_mass: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Return row, column and log weight of all but the smallest weights of a row."""
+    """Return which weights are kept, their columns and logarithms, each ``(b, k)``."""
     # The sum starts at the smallest weights, so that rounding does not lose them.
     ascending, order = weights.sort(dim=1)
     kept = (ascending.cumsum(dim=1, dtype=torch.double) > tail_mass) & (ascending > 0)
     kept[:, -1] = True
-    return kept.nonzero()[:, 0], order[kept], ascending[kept].double().log()
-
-
-def _log_sum_exp(log_terms: Tensor, row: Tensor, num_rows: int) -> Tensor:
-    """Sum the terms ``(S, K)`` of each row, ``(S, num_rows)``."""
-    index = row.expand_as(log_terms)
-    largest = log_terms.new_full((len(log_terms), num_rows), -torch.inf)
-    largest = largest.scatter_reduce(1, index, log_terms.detach(), "amax")
-    largest = largest.where(torch.isfinite(largest), 0.0)
-    terms = (log_terms - largest.gather(1, index)).exp()
-    total = torch.zeros_like(largest).index_add(1, row, terms)
-    return total.log() + largest
+    k = int(kept.sum(dim=1).max())
+    log_weights = ascending.double().log().where(kept, -torch.inf)
+    return kept[:, -k:], order[:, -k:], log_weights[:, -k:]
 
 
 def _chosen(weights: Tensor, row: Tensor) -> Tensor:

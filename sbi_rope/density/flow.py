@@ -2,19 +2,12 @@ r"""Trained flows behind their embedding nets, as one density."""
 
 import copy
 from collections.abc import Sequence
-from itertools import chain
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from sbi_rope.density.base import (
-    Density,
-    batches,
-    places,
-    without_nan,
-    without_nan_gradients,
-)
+from sbi_rope.density.base import Density, batches, places, without_nan
 from sbi_rope.npe.sbi import (
     ConditionalEstimator,
     embedding_of,
@@ -41,9 +34,9 @@ class Flow(Density):
     Args:
         nets: The embedding nets, E or one.
         densities: The densities behind them, E or one.
-        weights: w, which sum to one; equal if None.
         input_shape: Shape of the parameters, ``(d,)``.
         condition_shape: Shape of one observation.
+        weights: w, which sum to one; equal if None.
     """
 
     weights: Tensor
@@ -52,20 +45,18 @@ class Flow(Density):
         self,
         nets: Ensemble,
         densities: Ensemble,
-        weights: Tensor | None = None,
-        *,
         input_shape: Sequence[int],
         condition_shape: Sequence[int],
+        weights: Tensor | None = None,
     ) -> None:
         super().__init__(input_shape, condition_shape)
         if len(nets) > 1 and not has_parameters(nets):
             nets = nets[[0]]  # without parameters, all are the same
         self.nets, self.densities = nets, densities
         if weights is None:
-            count = max(len(nets), len(densities))
-            weights = torch.full((count,), 1.0 / count, dtype=torch.double)
-        stacks = chain(nets.parameters(), densities.parameters())
-        device = next((stack.device for stack in stacks), weights.device)
+            weights = torch.ones(max(len(nets), len(densities)), dtype=torch.double)
+            weights = weights / len(weights)
+        device = next((one.device for one in self.parameters()), weights.device)
         self.register_buffer("weights", weights.to(device))
         self.eval().requires_grad_(requires_grad=False)
 
@@ -78,10 +69,8 @@ class Flow(Density):
     ) -> "Flow":
         """Return the average of copies of estimators of sbi, or with other ``nets``."""
         first = estimators[0]
-        own = {id(one): embedding_of(one) for one in estimators}
-        nets = [own[id(one)] for one in estimators] if nets is None else nets
-        bare = {id(one): headless(one) for one in estimators}
-        densities = [bare[id(one)] for one in estimators]
+        nets = [embedding_of(one) for one in estimators] if nets is None else nets
+        densities = [headless(one) for one in estimators]
         with seeded(0), torch.no_grad():
             x = torch.randn(3, *first.condition_shape).to(next(first.parameters()))
             z = embedded(copy.deepcopy(nets[0]).eval(), x)
@@ -90,29 +79,32 @@ class Flow(Density):
         return cls(
             Ensemble(nets, embedded, (x,)),
             Ensemble(densities, log_density, (theta, z)),
-            input_shape=first.input_shape,
-            condition_shape=first.condition_shape,
+            first.input_shape,
+            first.condition_shape,
         )
 
     @classmethod
     def joined(cls, flows: "Sequence[Flow]") -> "Flow":
         """Return the average of flows that come from one NPE, with equal weights."""
-        parts = []
-        for of_each in zip(*((one.nets, one.densities) for one in flows), strict=True):
+
+        def joined(parts: Sequence[Ensemble]) -> Ensemble:
             # Where all have the same net, or density, the average has one, too.
-            stacks = [list(one.parameters()) for one in of_each]
-            same = all(all(map(torch.equal, stacks[0], other)) for other in stacks)
-            if same and all(len(one) == 1 for one in of_each):
-                parts.append(copy.deepcopy(of_each[0]))
-                continue
+            first, *others = (list(one.parameters()) for one in parts)
+            same = all(all(map(torch.equal, first, other)) for other in others)
+            if same and all(len(one) == 1 for one in parts):
+                return copy.deepcopy(parts[0])
+            sizes = [flow.num_members for flow in flows]
             full = [
-                one if len(one) > 1 else one[[0] * flow.num_members]
-                for one, flow in zip(of_each, flows, strict=True)
+                one if len(one) > 1 else one[[0] * size]
+                for one, size in zip(parts, sizes, strict=True)
             ]
-            parts.append(Ensemble.joined(full))
-        weights = torch.cat([one.weights / len(flows) for one in flows])
-        nets, densities = parts
-        return flows[0]._with(nets, densities, weights)
+            return Ensemble.joined(full)
+
+        return flows[0]._with(
+            joined([one.nets for one in flows]),
+            joined([one.densities for one in flows]),
+            torch.cat([one.weights / len(flows) for one in flows]),
+        )
 
     @property
     def num_members(self) -> int:
@@ -120,13 +112,12 @@ class Flow(Density):
         return len(self.weights)
 
     def __getitem__(self, numbers: Tensor | Sequence[int]) -> "Flow":
-        """Return the average of copies of some of the flows."""
-        some = torch.as_tensor(numbers)
+        """Return the average of copies of some of the flows; shared parts stay so."""
+        some, nets, densities = torch.as_tensor(numbers), self.nets, self.densities
+        nets = nets[some] if len(nets) > 1 else copy.deepcopy(nets)
+        own = len(densities) == self.num_members
+        densities = densities[some] if own else copy.deepcopy(densities)
         weights = self.weights[some]
-        nets, densities = (
-            one[some] if len(one) > 1 else copy.deepcopy(one)
-            for one in (self.nets, self.densities)
-        )
         return self._with(nets, densities, weights / weights.sum())
 
     def made_of(
@@ -137,20 +128,10 @@ class Flow(Density):
         own = self.nets if nets is None else nets
         return self._with(own[of_nets], self.densities[of_densities])
 
-    def behind_one_net(self, numbers: Sequence[int]) -> "Flow":
-        """Return the average of copies of some densities behind the net they share."""
-        return self._with(copy.deepcopy(self.nets), self.densities[numbers])
-
     def _with(
         self, nets: Ensemble, densities: Ensemble, weights: Tensor | None = None
     ) -> "Flow":
-        return Flow(
-            nets,
-            densities,
-            weights,
-            input_shape=self.input_shape,
-            condition_shape=self.condition_shape,
-        )
+        return Flow(nets, densities, self.input_shape, self.condition_shape, weights)
 
     def estimator(self, like: ConditionalEstimator | None = None) -> Any:
         """Return the first flow as an estimator of sbi, of the class of ``like``."""
@@ -170,8 +151,7 @@ class Flow(Density):
 
     def embeddings(self, x: Tensor) -> Tensor:
         """Embed the observations of each flow, ``(E, B, *event)`` to ``(E, B, l)``."""
-        z = self.nets.answer(embedded, x.flatten(0, 1))
-        return z.unflatten(0, x.shape[:2])
+        return self.nets.answer(embedded, x.flatten(0, 1)).unflatten(0, x.shape[:2])
 
     def losses_given(self, theta: Tensor, z: Tensor) -> Tensor:
         """Return the losses at embedded observations, shape ``(E, B, l)``."""
@@ -183,11 +163,10 @@ class Flow(Density):
     @torch.no_grad()
     def embed(self, x: Tensor) -> Tensor:
         """Return the embeddings of observations, ``(B, E, l)`` or ``(B, 1, l)``."""
-        count = len(self.nets)
-        parts = []
+        count, parts = len(self.nets), []
         for some in x.split(max(1, NET_BATCH // count)):
-            rows = some.repeat(count, *[1] * (x.ndim - 1))
-            parts.append(self.nets.answer(embedded, rows).unflatten(0, (count, -1)))
+            z = self.nets.answer(embedded, torch.cat([some] * count))
+            parts.append(z.unflatten(0, (count, -1)))
         return torch.cat(parts, dim=1).transpose(0, 1)
 
     def log_q(self, theta: Tensor, z: Tensor) -> Tensor:
@@ -197,16 +176,13 @@ class Flow(Density):
 
     def log_probs(self, theta: Tensor, z: Tensor) -> Tensor:
         """Return the log density of each flow at theta, ``(E, S, B)``, float64."""
-        shape, count = theta.shape[:2], self.num_members
-        theta = theta.flatten(0, 1)
-        row = torch.arange(shape[1], device=theta.device).repeat(shape[0])
-        parts = []
-        for pairs in batches(torch.arange(len(theta)).to(row), share=count):
-            of_each = z[row[pairs]].expand(-1, count, -1).transpose(0, 1)
-            points = theta[pairs].expand(count, -1, -1).flatten(0, 1)
-            log_probs = self.densities.answer(
-                log_density, without_nan_gradients(points), of_each.flatten(0, 1)
-            )
+        shape, count, parts = theta.shape[:2], self.num_members, []
+        points = theta.flatten(0, 1).expand(count, -1, -1)
+        row = torch.arange(len(z), device=theta.device).repeat(len(theta))
+        for some in batches(torch.arange(len(row)).to(row), share=count):
+            of_each = z[row[some]].expand(-1, count, -1).transpose(0, 1)
+            pairs = points[:, some].flatten(0, 1), of_each.flatten(0, 1)
+            log_probs = self.densities.answer(log_density, *pairs)
             parts.append(log_probs.double().reshape(count, -1))
         return without_nan(torch.cat(parts, dim=1)).reshape(count, *shape)
 
@@ -215,21 +191,19 @@ class Flow(Density):
         """Draw once for each of n numbers of observations, ``(n, d)``."""
         theta = []
         for some in batches(row):
-            probabilities = self.weights.cpu()
-            member = torch.multinomial(probabilities, len(some), replacement=True)
-            theta.append(self._drawn(z, some, member.to(row.device)))
-        return torch.cat(theta) if theta else z.new_empty(0, *self.input_shape)
-
-    def _drawn(self, z: Tensor, row: Tensor, member: Tensor) -> Tensor:
-        """Draw from the flow of each number, in one network of padded rows."""
-        of_net = member if z.shape[1] > 1 else torch.zeros_like(member)
-        if len(self.densities) == 1:
-            return self.densities.answer(drawn, z[row, of_net])
-        place = places(member)
-        padded = row.new_zeros(self.num_members, int(place.max()) + 1)
-        padded[member, place] = torch.arange(len(row), device=row.device)
-        theta = self.densities.answer(drawn, z[row, of_net][padded].flatten(0, 1))
-        return theta.reshape(*padded.shape, -1)[member, place]
+            member = torch.multinomial(self.weights.cpu(), len(some), replacement=True)
+            member = member.to(row.device)
+            conditions = z[some, member if z.shape[1] > 1 else 0]
+            if len(self.densities) == 1:
+                theta.append(self.densities.answer(drawn, conditions))
+                continue
+            # Each member draws for its own rows, padded to the same number for all.
+            place = places(member)
+            padded = row.new_zeros(self.num_members, int(place.max()) + 1)
+            padded[member, place] = torch.arange(len(some), device=row.device)
+            of_all = self.densities.answer(drawn, conditions[padded].flatten(0, 1))
+            theta.append(of_all.reshape(*padded.shape, -1)[member, place])
+        return torch.cat(theta)
 
     def readable(self, x: Tensor) -> Tensor:
         """Tell which observations all nets can read."""

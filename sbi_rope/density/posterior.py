@@ -3,7 +3,7 @@
 import copy
 import operator
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -11,14 +11,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_rope.coupling import Coupling
-from sbi_rope.density.base import (
-    DTYPE,
-    MAX_ENTRIES,
-    Accept,
-    Density,
-    Prior,
-    num_fitting,
-)
+from sbi_rope.density.base import DTYPE, MAX_ENTRIES, Accept, Density, Prior
 from sbi_rope.density.coupled import Coupled
 from sbi_rope.density.sets import MakesSets
 from sbi_rope.npe.prior import PriorDistribution
@@ -30,13 +23,14 @@ from sbi_rope.utils.seeds import seeded
 from sbi_rope.utils.settings import Count, Positive, check
 from sbi_rope.utils.tensors import as_batch, as_numbers, rows_with
 
-# An observation is slow if, after MIN_PROPOSALS proposals, less than a share of
-# MIN_ACCEPTANCE of them lies inside the prior's support. Rejection sampling gives up on
-# slow observations if they would take more than MAX_PROPOSALS further proposals, which
-# are minutes. In a stack the prior often keeps a share just below MIN_ACCEPTANCE.
-MIN_PROPOSALS, MIN_ACCEPTANCE, MAX_PROPOSALS = 100_000, 1e-3, 10_000_000
-# Observations for which this many proposals were all rejected are counted together.
-MIN_WITHOUT_ANY = 5_000
+# Rejection sampling gives up on observations of which, after MIN_OF_ROW proposals, less
+# than a share of MIN_ACCEPTANCE lies inside the prior's support, once these had
+# MIN_PROPOSALS together, and if they would take more than MAX_PROPOSALS further ones,
+# which are minutes. In a stack the prior often keeps a share just below MIN_ACCEPTANCE.
+MIN_OF_ROW, MIN_PROPOSALS, MAX_PROPOSALS = 5_000, 100_000, 10_000_000
+MIN_ACCEPTANCE = 1e-3
+# Where all were rejected, the share inside is taken for that of so many.
+PSEUDO_COUNT = 0.1
 # A flow takes about as long for this many draws as for a single one.
 SMALL_BATCH = 512
 
@@ -56,8 +50,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
 
     It has all methods of sbi's :class:`DirectPosterior` and works with sbi's
     diagnostics. That of RoPE belongs to a batch of observations, its ``x_o``. Others
-    are amortised and answer any x. Apart from arguments and result it needs some 150
-    MB.
+    are amortised and answer any x.
 
     References:
         | Addressing Misspecification in Simulation-based Inference through Data-driven
@@ -72,11 +65,14 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
     """
 
     prior: PriorDistribution
+    posterior_estimator: Density
     # One name for each parameter, and for each column of tables of x, if they have any.
     parameter_names: tuple[str, ...] | None = None
     x_names: tuple[str, ...] | None = None
     # Whether an amortised posterior warns of entries that are far from simulations.
     warns = True
+    # From which to which observation of the batch it belongs to.
+    _rows: tuple[int | None, ...] = (None,)
     # The observations that the mass was last estimated for, and this mass.
     _latest: tuple[Tensor, Tensor] | None = None
 
@@ -90,63 +86,48 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         # A category that sbi has standardised and put back may differ by rounding, and
         # is no category then.
         is_mixed = any(isinstance(part, MixedDensity) for part in density.modules())
-        enable_transform = enable_transform and not is_mixed
-        self._set_up(density, PriorDistribution(prior), enable_transform)
-
-    def _set_up(self, density: Density, prior: Any, enable_transform: bool) -> None:  # noqa: FBT001
         with seeded(0):  # sbi draws from the prior to find out about it
-            BaseDirectPosterior.__init__(
-                self,
+            super().__init__(
                 density,
-                prior,
+                PriorDistribution(prior),
                 device=str(density.device),
-                enable_transform=enable_transform,
+                enable_transform=enable_transform and not is_mixed,
             )
-        self.posterior_estimator: Density = density
 
     def __str__(self) -> str:
         of = "any x" if self.is_amortised else f"each of {len(self)} x"
         return f"{type(self).__name__} p(θ|x) of {of}"
-
-    def __getstate__(self) -> dict[str, Any]:
-        # Copies, files and posteriors of single observations do without it.
-        return {**super().__getstate__(), "_latest": None}
 
     # --- the batch ---
 
     @property
     def is_amortised(self) -> bool:
         """Whether it answers any x, and belongs to no batch."""
-        return not self.posterior_estimator.coupled
+        return not isinstance(self.posterior_estimator, Coupled)
 
     @property
     def x_o(self) -> Tensor:
         """The batch of real observations, shape ``(n_o, *event)``."""
-        return self._coupled[0].x_o
+        return self._coupled.x_o[slice(*self._rows)]
 
     @property
     def coupling(self) -> Coupling:
-        """The coupling of the batch with the simulations, if there is a single one."""
-        coupled, *others = self._coupled
-        if others:
-            raise InvalidInputError(
-                f"Expected a single coupling; got {1 + len(others)} in an average."
-            )
-        return coupled.coupling
+        """The coupling of the batch with the simulations."""
+        return self._coupled.coupling
 
     @property
     def weights(self) -> Tensor:
-        """Weights of the simulations in the coupled part, shape ``(n_o, n_s)``."""
-        return self.coupling.weights
+        """Weights of the simulations, shape ``(n_o, n_s)``."""
+        return self.coupling.weights[slice(*self._rows)]
 
     @property
-    def _coupled(self) -> Sequence[Coupled]:
-        if not (coupled := self.posterior_estimator.coupled):
+    def _coupled(self) -> Coupled:
+        if not isinstance(self.posterior_estimator, Coupled):
             raise InvalidInputError(
                 "Expected a posterior of a batch; got an amortised one, which has no "
                 "`x_o`, coupling or length."
             )
-        return coupled
+        return self.posterior_estimator
 
     def __len__(self) -> int:
         return len(self.x_o)
@@ -156,85 +137,61 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
 
     def __getitem__(self, index: int) -> "MixturePosterior":
         """Return the posterior of one observation alone, which is its default x."""
-        index = range(len(self))[operator.index(index)]
-        density = self.posterior_estimator.restricted_to(index)
-        view = copy.copy(self)
-        view.posterior_estimator = density
-        potential_fn: Any = copy.copy(self.potential_fn)
-        potential_fn.posterior_estimator = density
-        potential_fn.set_x(None)  # another observation may have been asked for last
-        view.potential_fn = potential_fn
-        view.set_default_x(view.x_o)
-        return view
+        x, view = self.x_o[operator.index(index)], copy.copy(self)
+        first = range(len(self._coupled.x_o))[slice(*self._rows)][index]
+        view._rows = (first, first + 1)
+        view.potential_fn = copy.copy(self.potential_fn)  # which holds an x
+        return view.set_default_x(x)
 
     def to(self, device: str | torch.device) -> None:
         """Move the posterior, its coupling and its batch to a device.
 
         Posteriors of single observations (``posterior[i]``) have to be taken again.
         """
-        x, self._latest = self.default_x, None
-        self.prior.to(device)
-        density = self.posterior_estimator.to(device)
-        self._set_up(density, self.prior, self.enable_transform)
-        if x is not None:
-            self._keep_default_x(x)
+        self._latest = None
+        with seeded(0):  # sbi draws from the prior to find out about it
+            super().to(device)
 
     # --- arguments ---
 
     def set_default_x(self, x: Tensor) -> "MixturePosterior":
         """Set the observation ``(*event)`` of methods that are given none."""
-        self._keep_default_x(self._warned_of(self._batch_of_x(x)))
+        self._keep_default_x(self._one_x(x))
         return self
 
-    def _one_x(self, x: Tensor | None) -> Tensor:
-        x = self.default_x if x is None else x
-        if x is None:
-            raise InvalidInputError(
-                "Expected an observation `x`, or a default x; got neither."
-            )
-        batch = self._batch_of_x(x)
-        if len(batch) > 1:
-            raise InvalidInputError(
-                f"Expected one observation; got {len(batch)}. For several, use the "
-                "`_batched` methods."
-            )
-        return batch
+    def _one_x(self, x: Any) -> Tensor:
+        return self._batch_of_x(self.default_x if x is None else x, rows=1)
 
-    def _batch_of_x(self, x: Any) -> Tensor:
-        """Return observations ``(n, *event)`` if the density can read them."""
+    def _batch_of_x(self, x: Any, *, rows: int | None = None) -> Tensor:
+        """Return observations ``(n, *event)``; warn of those far from simulations."""
         density = self.posterior_estimator
+        event = density.condition_shape
         x = as_numbers("x", x, names=self.x_names).to(DTYPE)
-        x = x[None] if x.shape == density.condition_shape else x
-        x = as_batch("x", x, density.condition_shape, finite=False).to(density.device)
+        x = x[None] if x.shape == event else x
+        x = as_batch("x", x, event, rows=rows, finite=False).to(density.device)
         if not torch.isfinite(x).all() and (unread := ~density.readable(x)).any():
             raise InvalidInputError(
                 "Expected `x` without NaN or Inf that the embedding net cannot read; "
                 f"got {rows_with(unread)}."
             )
-        return x
-
-    def _parameters(self, theta: Any, *, batched: bool = False) -> Tensor:
-        """Return parameters in float32, ``(n, d)``, or ``(S, B, d)`` of a batch."""
-        # A bound of the prior is one in float32 only: 0.1 of float64 is below it.
-        dim = self.posterior_estimator.input_shape[0]
-        numbers = as_numbers("theta", theta, names=self.parameter_names)
-        theta = theta if isinstance(theta, Tensor) else numbers  # which has gradients
-        shape = tuple(theta.shape)
-        if theta.ndim not in ((2, 3) if batched else (1, 2)) or shape[-1] != dim:
-            expected = f"(B, {dim}) or (S, B, {dim})" if batched else f"(n, {dim})"
-            raise InvalidInputError(
-                f"Expected `theta` of shape {expected}; got {shape}."
-            )
-        if torch.isnan(theta).any() or not len(theta):
-            raise InvalidInputError("Expected `theta` with numbers; got NaN or none.")
-        theta = torch.atleast_2d(theta).to(self.posterior_estimator.device, DTYPE)
-        return theta[None] if batched and theta.ndim == 2 else theta
-
-    def _warned_of(self, x: Tensor) -> Tensor:
-        """Return observations, after a warning if entries are far from simulations."""
         if self.warns and self.is_amortised:  # RoPE has warned of its batch
-            warn_of_far_entries("x", x, self.posterior_estimator)
+            warn_of_far_entries("x", x, density)
         return x
+
+    def _parameters(self, theta: Any, *, most_dims: int) -> Tensor:
+        """Return parameters ``(*batch, d)`` in float32, with their gradients."""
+        dim = self.posterior_estimator.input_shape[0]
+        if not isinstance(theta, Tensor):
+            theta = as_numbers("theta", theta, names=self.parameter_names)
+        shape, batch = tuple(theta.shape), ("n", "S, B")[most_dims - 2]
+        theta = torch.atleast_2d(theta)
+        is_empty = not theta.numel() or theta.isnan().any()
+        if theta.ndim > most_dims or theta.shape[-1] != dim or is_empty:
+            raise InvalidInputError(
+                f"Expected `theta` of shape ({batch}, {dim}) without NaN; got {shape}."
+            )
+        # A bound of the prior is one in float32 only: 0.1 of float64 is below it.
+        return theta.to(self.posterior_estimator.device, DTYPE)
 
     # --- samples ---
 
@@ -280,37 +237,34 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         """
         check("max_sampling_time", max_sampling_time, Positive | None)
         check("max_sampling_batch_size", max_sampling_batch_size, Count | None)
-        x = self._warned_of(self._batch_of_x(x))
-        shape = torch.Size(sample_shape)
-        density = self.posterior_estimator.eval()
-        z = density.embed(x)
-        num_samples, num_rows = shape.numel(), len(x)
+        x, density = self._batch_of_x(x), self.posterior_estimator.eval()
+        z, num_rows, shape = density.embed(x), len(x), torch.Size(sample_shape)
+        num_samples = shape.numel()
         total, start = num_samples * num_rows, time.monotonic()
 
-        def propose(row: Tensor) -> Tensor:
+        def draw(row: Tensor) -> Tensor:
             if max_sampling_time and time.monotonic() > start + max_sampling_time:
                 raise SamplingError(
                     "Sampling took longer than `max_sampling_time`: not all of "
                     f"{total} draws were made."
                 )
-            parts = row.split(max_sampling_batch_size or len(row))
-            return torch.cat([density.draw(z, some) for some in parts])
+            return density.draw(z, row)
 
-        draw: Callable[[Tensor], Tensor] = propose
+        size = min(MAX_ENTRIES, max_sampling_batch_size or MAX_ENTRIES)
+        propose: Callable[[Tensor], Tensor] = draw
         if reject_outside_prior:
-            draw = rejecting(propose, self.prior.inside, num_rows)
+            propose = rejecting(draw, self.prior.inside, num_rows, size)
         theta = torch.empty(total, *density.input_shape, device=density.device)
+        # Observation by observation, so that few of them are needed at a time.
+        slots = torch.arange(total, device=theta.device).split(size)
         show = is_shown(show_progress_bars)
         with (
             torch.no_grad(),
             progress_bar(show=show, desc="Sampling", total=total) as bar,
         ):
-            # Observation by observation, so that few of them are needed at a time.
-            for first in range(0, total, MAX_ENTRIES):
-                last = min(first + MAX_ENTRIES, total)
-                slot = torch.arange(first, last, device=theta.device)
+            for slot in slots if total else ():
                 row, number = slot // num_samples, slot % num_samples
-                theta[number * num_rows + row] = draw(row)
+                theta[number * num_rows + row] = propose(row)
                 bar.update(len(slot))
         return theta.reshape(*shape, num_rows, *density.input_shape)
 
@@ -338,11 +292,15 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             InvalidInputError: If x is not in the batch and ``unseen="raise"``.
             SamplingError: If the density has no mass inside the prior's support.
         """
-        theta, x = self._parameters(theta)[:, None], self._warned_of(self._one_x(x))
-        return self._log_prob(theta, x, norm_posterior, track_gradients)[:, 0]
+        theta, x = self._parameters(theta, most_dims=2)[:, None], self._one_x(x)
+        return self.log_prob_batched(theta, x, norm_posterior, track_gradients)[:, 0]
 
     def log_prob_batched(  # type: ignore[override]
-        self, theta: Any, x: Any, *args: Any, **options: Any
+        self,
+        theta: Any,
+        x: Any,
+        norm_posterior: bool = True,  # noqa: FBT001, FBT002
+        track_gradients: bool = False,  # noqa: FBT001, FBT002
     ) -> Tensor:
         r"""Return :math:`\log p(\theta_b \mid x_b)` for every observation of a batch.
 
@@ -351,30 +309,19 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         all rows of theta. The other arguments, and errors, are those of
         :meth:`log_prob`. The result has shape ``(1, B)`` or ``(S, B)``.
         """
-        theta = self._parameters(theta, batched=True)
-        x = self._warned_of(self._batch_of_x(x))
-        if {theta.shape[1], len(x)} - {1, max(theta.shape[1], len(x))}:
+        theta, x = self._parameters(theta, most_dims=3), self._batch_of_x(x)
+        theta = theta if theta.ndim == 3 else theta[None]
+        if theta.shape[1] != len(x) and 1 not in (theta.shape[1], len(x)):
             raise InvalidInputError(
                 "Expected as many rows of `theta` as observations, or one of them; "
                 f"got theta {tuple(theta.shape)} and {len(x)} observations."
             )
-        return self._log_prob(theta, x, *args, **options)
-
-    def _log_prob(
-        self,
-        theta: Tensor,
-        x: Tensor,
-        norm_posterior: bool = True,  # noqa: FBT001, FBT002
-        track_gradients: bool = False,  # noqa: FBT001, FBT002
-    ) -> Tensor:
-        """Return the log density at theta ``(S, B, d)``; x is embedded once."""
         density = self.posterior_estimator.eval()
         # Networks may be NaN outside.
         safe, inside = self.prior.moved_inside(theta.flatten(0, 1))
         z = density.embed(x)
         with torch.set_grad_enabled(track_gradients):
-            safe = safe.reshape(theta.shape)
-            log_prob = density.log_prob_given(safe, z, len(x))
+            log_prob = density.log_prob_given(safe.reshape(theta.shape), z, len(x))
         if norm_posterior:
             log_prob = log_prob - self._normaliser(x, z).log()
         inside = inside.reshape(theta.shape[:2])
@@ -386,11 +333,10 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         The defaults are smaller than those of sbi, which would take many minutes:
         ``num_iter`` and ``num_init_samples`` are 100, and ``num_to_optimize`` is 5.
         """
-        own: dict[str, Any] = dict(
-            num_iter=100, num_init_samples=100, num_to_optimize=5
-        )
+        own = {"num_iter": 100, "num_init_samples": 100, "num_to_optimize": 5}
+        options = {**own, **options}
         with torch.enable_grad():  # the caller may have switched gradients off
-            return super().map(x=x, **(own | options))
+            return super().map(x=x, **options)
 
     # --- normalisation ---
 
@@ -423,60 +369,46 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
 
 
 def rejecting(
-    propose: Callable[[Tensor], Tensor], accept: Accept, num_rows: int
+    draw: Callable[[Tensor], Tensor], accept: Accept, num_rows: int, size: int
 ) -> Callable[[Tensor], Tensor]:
-    """Return a function that proposes until a draw of each row is accepted."""
+    """Return a function that draws for rows until one of each is accepted."""
     proposed, inside = torch.zeros(2, num_rows, dtype=torch.long)
 
-    def draw(row: Tensor) -> Tensor:
-        theta = torch.empty(0)
-        still_open = torch.ones_like(row, dtype=torch.bool)
-        rate = 1.0
-        while (open_slots := still_open.nonzero().flatten()).numel():
-            # For the last few slots, more proposals take no longer than one.
-            count = len(open_slots)
+    def accepted(row: Tensor) -> Tensor:
+        theta, rate = torch.empty(0), 1.0
+        left = torch.arange(len(row), device=row.device)
+        while count := len(left):
+            # For the last few, more proposals take no longer than one.
             wanted = max(int(1 / max(rate, MIN_ACCEPTANCE)), SMALL_BATCH // count)
-            repeats = max(1, min(wanted, num_fitting(count)))
-            proposals = open_slots.repeat_interleave(repeats)
-            rows = row[proposals]
-            draws = propose(rows)
-            accepted = accept(draws)
+            repeats = max(1, min(wanted, size // count))
+            rows = row[left].repeat_interleave(repeats)
+            draws = draw(rows)
+            fits = accept(draws)
             if not len(theta):
                 theta = draws.new_empty(len(row), *draws.shape[1:])
-            # Of several proposals for a slot the first accepted one is kept.
-            chosen = accepted.nonzero().flatten()
-            filled = proposals[chosen]
-            first = filled != filled.roll(1)
-            first[:1] = True
-            theta[filled[first]] = draws[chosen[first]]
-            still_open[filled] = False
+            rate = float(fits.double().mean())
             proposed.add_(rows.bincount(minlength=num_rows).cpu())
-            inside.add_(rows[accepted].bincount(minlength=num_rows).cpu())
-            missing = row[still_open].bincount(minlength=num_rows).cpu()
-            _give_up_on_hopeless(proposed, inside, missing)
-            rate = float(accepted.double().mean())
+            inside.add_(rows[fits].bincount(minlength=num_rows).cpu())
+            # Of several proposals for one the first that fits is kept.
+            fits = fits.reshape(count, repeats)
+            found, first = fits.any(dim=1), fits.byte().argmax(dim=1)
+            first = first + repeats * torch.arange(count, device=row.device)
+            theta[left[found]] = draws[first[found]]
+            left = left[~found]
+            missing = row[left].bincount(minlength=num_rows).cpu()
+            is_slow = (missing > 0) & (proposed >= MIN_OF_ROW)
+            is_slow &= inside < MIN_ACCEPTANCE * proposed
+            further = (missing * proposed / (inside + PSEUDO_COUNT))[is_slow].sum()
+            if proposed[is_slow].sum() >= MIN_PROPOSALS and further > MAX_PROPOSALS:
+                numbers = is_slow.nonzero().flatten()[:5].tolist()
+                raise SamplingError(
+                    f"Less than one in {1 / MIN_ACCEPTANCE:g} draws lies inside the "
+                    f"support of the prior for rows {numbers} of `x`. Leave these out, "
+                    "train NPE longer, or pass reject_outside_prior=False."
+                )
         return theta
 
-    return draw
-
-
-def _give_up_on_hopeless(proposed: Tensor, inside: Tensor, missing: Tensor) -> None:
-    """Raise if some rows would take too many more proposals."""
-    share = inside / proposed.clamp_min(1)
-    slow = (missing > 0) & (proposed >= MIN_PROPOSALS) & (share < MIN_ACCEPTANCE)
-    # Infinite if nothing was accepted so far.
-    further = (missing[slow] / share[slow]).sum()
-    hopeless = slow & (further > MAX_PROPOSALS)
-    without_any = (proposed >= MIN_WITHOUT_ANY) & (inside == 0)
-    if int(proposed[without_any].sum()) >= MIN_PROPOSALS:
-        hopeless |= without_any
-    if hopeless.any():
-        numbers = hopeless.nonzero().flatten()[:5].tolist()
-        raise SamplingError(
-            f"Less than one in {int(1 / MIN_ACCEPTANCE)} draws lies inside the support "
-            f"of the prior for rows {numbers} of `x`. Leave these observations out, "
-            "train NPE longer, or pass reject_outside_prior=False."
-        )
+    return accepted
 
 
 class PriorPosterior(MixturePosterior):
@@ -501,15 +433,11 @@ class PriorPosterior(MixturePosterior):
     """
 
     def __init__(self, prior: Any) -> None:
-        density = Prior(prior, (0,))
-        try:
-            super().__init__(density, density.prior)
-        except Exception:  # sbi raises all kinds if it cannot transform the prior
-            super().__init__(density, density.prior, enable_transform=False)
+        # Some priors have no transform.
+        super().__init__(Prior(prior, (0,)), prior, enable_transform=False)
 
     def _one_x(self, x: Any) -> Tensor:
         return torch.empty(1, 0, device=self.posterior_estimator.device)
 
-    def _batch_of_x(self, x: Any) -> Tensor:
-        count = len(as_numbers("x", x))
-        return torch.empty(count, 0, device=self.posterior_estimator.device)
+    def _batch_of_x(self, x: Any, *, rows: int | None = None) -> Tensor:
+        return self._one_x(x).expand(len(as_numbers("x", x)), 0)

@@ -8,10 +8,11 @@ import numpy as np
 import torch
 from scipy.optimize import minimize
 from torch import Tensor, nn
-from torch.distributions import Chi2
+from torch.distributions import Chi2, MultivariateNormal
 
 from sbi_rope.density.base import Density
 from sbi_rope.npe.sbi import embed
+from sbi_rope.utils.tensors import divisors
 
 # More entries than these are reduced to principal components, at most so many.
 MAX_ENTRIES, MAX_COMPONENTS = 20, 10
@@ -45,6 +46,9 @@ class GaussianProcess(Density):
         weights: How many independent pairs each counts as, shape ``(n,)``.
         groups: The number of the group of each, shape ``(n,)``.
         net: An embedding net, if the process is one of h(x).
+
+    Attributes:
+        hyperparameters: The variance of k, its length scales, and the noise.
     """
 
     mean: Tensor
@@ -54,7 +58,6 @@ class GaussianProcess(Density):
     inverse: Tensor
     coefficients: Tensor
     centre: Tensor
-    std: Tensor
     factor: Tensor
     degrees: Tensor
 
@@ -68,55 +71,48 @@ class GaussianProcess(Density):
         net: nn.Module | None = None,
     ) -> None:
         super().__init__(theta.shape[1:], x.shape[1:])
-        self.representation = copy.deepcopy(net)
+        self.representation = nn.Identity() if net is None else copy.deepcopy(net)
         w, phi, theta = weights.double(), self._represented(x), theta.double()
-        for name, value in zip(("mean", "to_inputs"), _inputs(phi), strict=True):
-            self.register_buffer(name, value)
-        self.register_buffer("inputs", (phi - self.mean) @ self.to_inputs)
-        centre, std = _moments(theta, w)
+        mean, to_inputs = _inputs(phi)
+        centre = w @ theta / w.sum()
+        std = divisors((w @ (theta - centre).square() / w.sum()).sqrt())
         y = (theta - centre) / std
-        self.register_buffer("hyperparameters", _learned(self.inputs, y))
-        noise = self.hyperparameters[-1] / w
-        covariance = self._kernel(self.inputs) + noise.diag()
+        learned = _learned((phi - mean) @ to_inputs, y)
+        to_inputs = to_inputs / learned[1:-1]  # in length scales
+        inputs = (phi - mean) @ to_inputs
+        covariance = _kernel(inputs, inputs, learned[0]) + (learned[-1] / w).diag()
         inverse = torch.linalg.inv(covariance)
-        coefficients = inverse @ y
-        errors = torch.empty_like(y)
+        coefficients, errors = inverse @ y, torch.empty_like(y)
         for group in groups.unique():
             rows = (groups == group).nonzero()[:, 0]
             block = torch.linalg.inv(inverse[rows][:, rows])
             errors[rows] = block @ coefficients[rows] / block.diagonal().sqrt()[:, None]
-        one = torch.eye(theta.shape[1]).to(errors)
-        scatter = errors.T @ (w[:, None] * errors) + PSEUDO_PAIRS * one
+        scatter = errors.T @ (w[:, None] * errors)
+        scatter = scatter + PSEUDO_PAIRS * torch.eye(len(std)).to(errors)
         factor = torch.linalg.cholesky(scatter / (w.sum() + PSEUDO_PAIRS))
+        degrees = (w.sum() + PSEUDO_PAIRS - len(std)).clamp_min(PSEUDO_PAIRS)
+        self.register_buffer("mean", mean)
+        self.register_buffer("to_inputs", to_inputs)
+        self.register_buffer("inputs", inputs)
+        self.register_buffer("hyperparameters", learned)
         self.register_buffer("inverse", inverse)
-        self.register_buffer("coefficients", coefficients)
+        self.register_buffer("coefficients", std * coefficients)
         self.register_buffer("centre", centre)
         self.register_buffer("factor", std[:, None] * factor)
-        degrees = (w.sum() + PSEUDO_PAIRS - theta.shape[1]).clamp_min(PSEUDO_PAIRS)
         self.register_buffer("degrees", degrees)
-        self.register_buffer("std", std)
         self.eval().requires_grad_(requires_grad=False)
 
     def _represented(self, x: Tensor) -> Tensor:
-        z = x if self.representation is None else embed(self.representation, x)
-        return z.flatten(1).double()
-
-    def _kernel(self, inputs: Tensor) -> Tensor:
-        """Return the kernel of inputs ``(B, k)`` and those of the pairs, ``(B, n)``."""
-        variance, *lengths, _ = self.hyperparameters.split(1)
-        scale = torch.cat(lengths)
-        return variance * torch.exp(
-            -torch.cdist(inputs / scale, self.inputs / scale).square() / 2
-        )
+        return embed(self.representation, x).flatten(1).double()
 
     def embed(self, x: Tensor) -> Tensor:
         """Return m(x) and s(x) of observations, ``(B, d + 1)``, float64."""
-        inputs = (self._represented(x) - self.mean) @ self.to_inputs
-        kernel = self._kernel(inputs)
-        explained = ((kernel @ self.inverse) * kernel).sum(dim=1, keepdim=True)
         variance, noise = self.hyperparameters[0], self.hyperparameters[-1]
+        inputs = (self._represented(x) - self.mean) @ self.to_inputs
+        kernel = _kernel(inputs, self.inputs, variance)
+        explained = ((kernel @ self.inverse) * kernel).sum(dim=1, keepdim=True)
         scale = (variance - explained).clamp_min(0.0).add(noise).sqrt()
-        mean = self.centre + self.std * (kernel @ self.coefficients)
+        mean = self.centre + kernel @ self.coefficients
         return torch.cat([mean, scale], dim=1)
 
     def log_q(self, theta: Tensor, z: Tensor) -> Tensor:
@@ -143,10 +139,9 @@ class GaussianProcess(Density):
         return (mean + scale * normal / chi.sqrt()).float()
 
 
-def _moments(values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    mean = weights @ values / weights.sum()
-    std = (weights @ (values - mean).square() / weights.sum()).sqrt()
-    return mean, torch.where(std > 0, std, 1.0)
+def _kernel(a: Tensor, b: Tensor, variance: Tensor) -> Tensor:
+    """Return the kernel of all inputs in length scales, ``(n, m)``."""
+    return variance * torch.exp(-torch.cdist(a, b).square() / 2)
 
 
 def _inputs(phi: Tensor) -> tuple[Tensor, Tensor]:
@@ -165,30 +160,27 @@ def _inputs(phi: Tensor) -> tuple[Tensor, Tensor]:
 
 def _learned(inputs: Tensor, y: Tensor) -> Tensor:
     """Return the variance, the length scales and the noise at their posterior mode."""
-    from sklearn.gaussian_process import GaussianProcessRegressor
-    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
-
     some = torch.randperm(len(inputs))[:MAX_PAIRS].to(inputs.device)
-    width = inputs.shape[1]
-    lengths: Any = np.full(width, LENGTH[0] * width**0.5)
-    kernel: Any = (
-        ConstantKernel(VARIANCE[0], (1e-3, 1e4)) * RBF(lengths, (1e-2, 1e5))
-    ) + WhiteKernel(NOISE[0], (1e-8, 1e2))
-    spread = np.array([VARIANCE[1], *[LENGTH[1]] * width, NOISE[1]])
+    inputs, targets, width = inputs[some].cpu(), y[some].cpu(), inputs.shape[1]
+    medians = [VARIANCE[0], *[LENGTH[0] * width**0.5] * width, NOISE[0]]
+    start = torch.tensor(medians, dtype=torch.double).log()
+    spread = torch.tensor([VARIANCE[1], *[LENGTH[1]] * width, NOISE[1]])
+    bounds = np.log([(1e-3, 1e4), *[(1e-2, 1e5)] * width, (1e-8, 1e2)])
 
-    def mode(loss: Any, start: Any, bounds: Any) -> tuple[Any, Any]:
-        def negative_log_posterior(at: np.ndarray) -> tuple[Any, Any]:
-            value, gradient = loss(at)
-            off = (at - start) / spread
-            return value + off @ off / 2, gradient + off / spread
+    @torch.enable_grad()
+    def negative_log_posterior(at: np.ndarray) -> tuple[float, np.ndarray]:
+        log = torch.from_numpy(at).requires_grad_()
+        variance, lengths, noise = log.exp().tensor_split([1, -1])
+        scaled = inputs / lengths
+        covariance = _kernel(scaled, scaled, variance) + noise * torch.eye(len(scaled))
+        law = MultivariateNormal(torch.zeros(len(scaled)).double(), covariance)
+        value = ((log - start) / spread).square().sum() / 2
+        value = value - law.log_prob(targets.T).sum()
+        (gradient,) = torch.autograd.grad(value, log)
+        return value.item(), gradient.numpy()
 
-        options: Any = {"method": "L-BFGS-B", "options": {"maxiter": MAX_STEPS}}
-        found = minimize(
-            negative_log_posterior, start, jac=True, bounds=bounds, **options
-        )
-        return found.x, found.fun
-
-    optimiser: Any = mode
-    process: Any = GaussianProcessRegressor(kernel, optimizer=optimiser)
-    process.fit(inputs[some].cpu().numpy(), y[some].cpu().numpy())
-    return torch.from_numpy(np.exp(process.kernel_.theta)).to(y)
+    options: Any = {"method": "L-BFGS-B", "options": {"maxiter": MAX_STEPS}}
+    found = minimize(
+        negative_log_posterior, start.numpy(), jac=True, bounds=bounds, **options
+    )
+    return torch.from_numpy(np.exp(found.x)).to(y)

@@ -14,24 +14,19 @@ Each score is that of the posterior of fold k(i), which has not seen the pair:
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_rope.npe.sbi import MixedDensity
 from sbi_rope.utils.errors import InvalidInputError
 from sbi_rope.utils.seeds import seeded
 from sbi_rope.utils.settings import Count, Level, check, default_names
 from sbi_rope.utils.tensors import as_batch, as_numbers
 
 LOWEST_LEVEL = 0.5  # Below, the guarantee says nothing, and intervals may be empty.
-# A set reaches further than the draws of a stack that is too narrow. To measure it,
-# draws are moved away from their mean by these factors.
-STRETCHES = (1.0, 2.0, 4.0)
 MAX_PRINTED = 20  # intervals
 NO_GUARANTEE = "There is no guarantee. The level is right for calibrated posteriors."
 
@@ -135,11 +130,10 @@ class Guarantee:
         \frac{1 - K/n}{K + 1} \Big\}, \qquad \alpha = 1 - \text{level},
 
     in theory, and of about the level in practice, on average over calibration sets and
-    observations. The theorem is for folds of equal size. It holds for the candidates of
-    a stack. The weights of the stack have seen the labels of a fold, which changes the
-    coverage by less than one per cent in simulations with 10 to 50 pairs. A set ends
-    where the support of the prior ends, and parameters beyond it are missed in
-    addition. :func:`sbi_rope.diagnose` tests if a batch is drawn as the pairs were.
+    observations. The theorem is for folds of equal size, and candidates of a stack. The
+    weights of the stack have seen the labels of a fold, which changes the coverage by
+    less than one per cent in simulations with 10 to 50 pairs. Parameters beyond the
+    support of the prior are missed in addition.
 
     References:
         | Predictive Inference with the Jackknife+ (Barber et al., 2021), theorem 4
@@ -221,31 +215,29 @@ class SetScores:
         return Guarantee(level=level, num_pairs=n, num_folds=len(self.weights))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class CredibleSet:
-    r"""A set of parameters that are credible given an observation, or each of a batch.
+    """What is credible given an observation, or each of a batch.
 
-    ``posterior.credible_set`` makes it. Its volume is estimated from draws
-    :math:`\theta_k` of a density q when it is first asked for:
-
-    .. math:: V = \frac1m \sum_k \frac{\mathbf{1}[\theta_k \in A]}{q(\theta_k)}
+    ``posterior.credible_set`` makes it. It is a set of all parameters together, and an
+    interval of each. Every interval has the level by itself, so that all parameters
+    are in their intervals less often.
 
     Attributes:
         level: The level that was asked for.
-        guarantee: The guarantee; None if there is none.
-        draws: The draws of q, shape ``(m, d)``, or ``(m, B, d)`` of a batch.
+        guarantee: The guarantee, of the set and of each interval; None if there is
+            none.
+        low: The lower ends of the intervals, shape ``(d,)``, or ``(B, d)`` of a batch.
+        high: The upper ends, as ``low``.
         rule: Tells which parameters ``(n, B, d)`` are in the sets, ``(n, B)``.
-        log_density: Returns :math:`\log q` of the draws, ``(m, B)``.
-        log_unit: The sum of the logs of the prior's standard deviations.
         parameter_names: One name for each parameter; None if they have none.
     """
 
     level: float
     guarantee: Guarantee | None
-    draws: Tensor
+    low: Tensor
+    high: Tensor
     rule: Callable[[Tensor], Tensor]
-    log_density: Callable[[], Tensor]
-    log_unit: float
     parameter_names: tuple[str, ...] | None
 
     @torch.no_grad()
@@ -254,128 +246,47 @@ class CredibleSet:
 
         For sets of a batch these are ``(*batch, B, d)`` and ``(*batch, B)``.
         """
-        rows, shape = _rows(theta, self.draws[0], self.parameter_names)
+        rows, shape = self._rows(theta)
         return self.rule(rows.reshape(len(rows), -1, shape[-1])).reshape(shape[:-1])
 
-    @cached_property
-    def _terms(self) -> Tensor:
-        inside = self.contains(self.draws)
-        log_density = self.log_density().double().reshape(inside.shape)
-        return torch.exp(-log_density).where(inside, 0.0)
-
-    @property
-    def volume(self) -> Tensor:
-        """The volume in the units of the parameters, shape ``()`` or ``(B,)``."""
-        return self._terms.mean(dim=0)
-
-    @property
-    def volume_error(self) -> Tensor:
-        """The Monte-Carlo standard error of ``volume``."""
-        return self._terms.std(dim=0) / len(self._terms) ** 0.5
-
-    @property
-    def volume_z(self) -> Tensor:
-        """The volume in standard deviations of the prior; NaN if it has none."""
-        return self.volume * math.exp(-self.log_unit)
-
-    def __str__(self) -> str:
-        dim = self.draws.shape[-1]
-        if self.draws.ndim > 2:
-            least, most = self.volume.min(), self.volume.max()
-            size = f"volumes of {least:.3g} to {most:.3g}, by observation"
-        else:
-            size = f"a volume of {self.volume:.3g} +- {self.volume_error:.1g}"
-            if not math.isnan(self.log_unit):
-                size += f", or {self.volume_z:.3g} in standard deviations of the prior"
-        return (
-            f"{100 * self.level:.4g}% set of {dim} parameter{'s' * (dim > 1)}, with "
-            f"{size}.\n{self.guarantee or NO_GUARANTEE}"
-        )
-
-    __repr__ = __str__  # which notebooks show
-
-
-@dataclass(frozen=True, eq=False)
-class CredibleIntervals:
-    """An interval for each parameter given an observation, or each of a batch.
-
-    ``posterior.credible_intervals`` makes it. Each interval has the level by itself, so
-    that all parameters together are inside less often. Of a batch, ``intervals[i]`` are
-    those of one observation.
-
-    Attributes:
-        low: The lower ends, shape ``(d,)``, or ``(B, d)`` of a batch.
-        high: The upper ends, as ``low``.
-        level: The level of each interval.
-        guarantee: The guarantee of each interval; None if there is none.
-        parameter_names: One name for each parameter; None if they have none.
-    """
-
-    low: Tensor
-    high: Tensor
-    level: float
-    guarantee: Guarantee | None
-    parameter_names: tuple[str, ...] | None
-
-    def __getitem__(self, index: int | slice) -> "CredibleIntervals":
-        """Return the intervals of one observation of a batch, or of several."""
-        return replace(self, low=self.low[index], high=self.high[index])
-
-    def contains(self, theta: Tensor) -> Tensor:
-        """Tell which parameters are in their intervals, one by one.
-
-        They have the shape ``(*batch, d)``, or ``(*batch, B, d)`` for intervals of a
-        batch, and so has the result.
-        """
-        rows, shape = _rows(theta, self.low, self.parameter_names)
+    def contains_each(self, theta: Tensor) -> Tensor:
+        """Tell which parameters are in their intervals, one by one, as theta."""
+        rows, shape = self._rows(theta)
         return ((self.low <= rows) & (rows <= self.high)).reshape(shape)
 
-    def as_rows(self) -> list[dict[str, Any]]:
-        """Return a row for each parameter: its name, and the ends of its interval.
+    def _rows(self, theta: Any) -> tuple[Tensor, torch.Size]:
+        """Return parameters as ``(n, *low.shape)``, and the shape that they had."""
+        theta = as_numbers("theta", theta, names=self.parameter_names)
+        count = max(1, theta.ndim - self.low.ndim)
+        rows = theta if theta.ndim > self.low.ndim else theta[None]
+        rows = as_batch("theta", rows.flatten(0, count - 1), self.low.shape)
+        return rows.to(self.low), theta.shape
 
-        The rows of a batch also hold the number of the observation, from 0.
-        """
-        if self.low.ndim > 1:
-            return [
-                {"observation": number, **row}
-                for number in range(len(self.low))
-                for row in self[number].as_rows()
-            ]
-        names = self.parameter_names or default_names(len(self.low))
-        ends = zip(names, self.low.tolist(), self.high.tolist(), strict=True)
-        return [{"parameter": name, "low": a, "high": b} for name, a, b in ends]
+    def as_rows(self) -> list[dict[str, Any]]:
+        """Return a row for each parameter of each observation, with its interval."""
+        width = self.low.shape[-1]
+        names = self.parameter_names or default_names(width)
+        ends = torch.stack([self.low, self.high], dim=-1).reshape(-1, width, 2).tolist()
+        return [
+            {"observation": number, "parameter": name, "low": low, "high": high}
+            for number, of_one in enumerate(ends)
+            for name, (low, high) in zip(names, of_one, strict=True)
+        ]
 
     def __str__(self) -> str:
-        lines = [f"{100 * self.level:.4g}% intervals, one by one:"]
+        lines = [f"{100 * self.level:.4g}% intervals of each parameter by itself:"]
         rows = self.as_rows()
         for row in rows[:MAX_PRINTED]:
-            of = f" observation {row['observation']}," if "observation" in row else ""
-            ends = _ends_in_words(row["low"], row["high"])
-            lines.append(f" {of} {row['parameter']}: {ends}")
+            number = f"observation {row['observation']}, " * (self.low.ndim > 1)
+            ends = f"{row['low']:.6g} to {row['high']:.6g}"
+            lines.append(f"  {number}{row['parameter']}: {ends}")
         if len(rows) > MAX_PRINTED:
             lines.append(f"  and {len(rows) - MAX_PRINTED} more")
-        promise = str(self.guarantee or NO_GUARANTEE)
         if self.low.shape[-1] > 1:
-            promise += " All parameters together are inside less often."
-        return "\n".join([*lines, promise])
+            lines.append("All parameters together are inside less often.")
+        return "\n".join([*lines, str(self.guarantee or NO_GUARANTEE)])
 
     __repr__ = __str__  # which notebooks show
-
-
-def _rows(theta: Any, like: Tensor, names: Any) -> tuple[Tensor, torch.Size]:
-    """Return parameters as ``(n, *like.shape)``, and the shape that they had."""
-    theta = as_numbers("theta", theta, names=names)
-    rows = theta if theta.ndim > like.ndim else theta[None]
-    rows = rows.flatten(0, max(0, rows.ndim - like.ndim - 1))
-    return as_batch("theta", rows, like.shape).to(like), theta.shape
-
-
-def _ends_in_words(low: float, high: float) -> str:
-    """Return both ends, with digits enough to see how wide the interval is."""
-    digits, width, largest = 4, high - low, max(abs(low), abs(high))
-    if 0 < width < math.inf:
-        digits = max(digits, 3 + math.floor(math.log10(largest / width)))
-    return f"{low:.{digits}g} to {high:.{digits}g}"
 
 
 class MakesSets:
@@ -384,119 +295,57 @@ class MakesSets:
     def credible_set(
         self: Any,
         level: float = 0.9,
-        x: Tensor | None = None,
+        x: Any = None,
         *,
         guaranteed: bool = False,
         num_samples: int = 1000,
         seed: int | None = None,
     ) -> CredibleSet:
-        r"""Return a set that is credible given an observation, or each of a batch.
+        r"""Return a set and intervals that are credible given x, or each of a batch.
 
-        It is the set of highest density,
+        The set is that of highest density,
         :math:`\{\theta: \log p(\theta \mid x) \ge t\}`, with t the (1 - level)
-        quantile of the log density of draws. It holds the true parameters with
-        the probability ``level`` only if the posterior is calibrated. With
-        ``guaranteed``, a stack corrects it by its out-of-fold scores, see
-        :class:`~sbi_rope.density.sets.Guarantee`.
+        quantile of the log density of draws, and the intervals are the central ones of
+        draws. They hold the true parameters with the probability ``level`` only if the
+        posterior is calibrated. With ``guaranteed``, a stack corrects them by its
+        out-of-fold scores, see :class:`~sbi_rope.density.sets.Guarantee`.
 
         Args:
-            level: The probability of the set.
+            level: The probability of the set, and of each interval by itself.
             x: An observation ``(*event)``, or a batch ``(B, *event)``, from the batch
                 of the posterior if there is one; the default x if None.
-            guaranteed: Whether the set shall hold the true parameters in about
-                ``level`` of the cases, even if the posterior is not calibrated. This
-                needs a stack, and observations drawn as its calibration pairs.
-            num_samples: The number of draws that the set and its volume are estimated
-                from. At least one of them has to be outside the set.
+            guaranteed: Whether they shall hold the true parameters in about ``level``
+                of the cases, even if the posterior is not calibrated. This needs a
+                stack, and observations drawn as its calibration pairs.
+            num_samples: The number of draws, of which some have to be outside. With
+                ``guaranteed`` there are as many as the stack was scored with.
             seed: Seed of the draws; None uses the states of torch, NumPy and Python.
 
-        Returns:
-            The set, which tells its volume and which parameters it contains.
-
         Raises:
-            InvalidInputError: If x is not in the batch and ``unseen="raise"``. With
-                ``guaranteed``, also if this is no stack, or if it has too few pairs.
+            InvalidInputError: If there are too few draws for the level. With
+                ``guaranteed``, if this is no stack, or if it has too few pairs.
+            LogProbUnavailableError: If ``contains`` is called without a density.
         """
-        x, is_one = _checked(self, level, x, num_samples, 0 if guaranteed else 1)
-        guarantee, stacks, fold, rank = None, [self], torch.tensor([0]), 1
+        check("level", level, Level)
+        check("num_samples", num_samples, Count)
+        density = self.posterior_estimator
+        shape: tuple[int, ...] = tuple(density.input_shape)
+        if x is None or np.ndim(x) == len(density.condition_shape):
+            x = self._one_x(x)
+        else:
+            x = self._batch_of_x(x)
+            shape = (len(x), *shape)
+        make = _guaranteed if guaranteed else _of_draws
         with seeded(seed), torch.no_grad():
-            if guaranteed:
-                pairs, stacks = self._held_out()
-                guarantee = pairs.guarantee(level)
-                fold, rank = pairs.fold, rank_needed(level, len(pairs))
-                scores = pairs.joint.to(x.device)
-                draws, log_density = _spread(self, x, num_samples)
-                log_probs = [
-                    _log_prob(one, _draw(one, pairs.num_draws, x), x) for one in stacks
-                ]
-            else:  # as if the draw at the quantile were the only pair
-                draws = _draw(self, num_samples, x)
-                log_probs = [_log_prob(self, draws, x)]
-                of_draws = joint_scores(log_probs[0], log_probs[0])
-                rank_of_draw = _round_up(level * num_samples)
-                scores = of_draws.kthvalue(rank_of_draw, keepdim=True).values[None]
-                log_density = partial(self.log_prob_batched, draws, x)
-
-        def rule(theta: Tensor) -> Tensor:
-            at_theta = [
-                joint_scores(_log_prob(stack, theta, x), of_draws)
-                for stack, of_draws in zip(stacks, log_probs, strict=True)
-            ]
-            held = is_held(scores, fold, torch.stack(at_theta), rank=rank).T
-            inside = self.prior.inside(theta.flatten(0, 1))
-            return held & inside.reshape(held.shape)
-
-        draws = draws[:, 0] if is_one else draws
-        unit, names = float(self.prior.log_units().sum()), self.parameter_names
-        return CredibleSet(level, guarantee, draws, rule, log_density, unit, names)
-
-    def credible_intervals(
-        self: Any,
-        level: float = 0.9,
-        x: Tensor | None = None,
-        *,
-        guaranteed: bool = False,
-        num_samples: int = 1000,
-        seed: int | None = None,
-    ) -> CredibleIntervals:
-        """Return an interval for each parameter given an observation, or each of B.
-
-        It is the central interval of draws. With ``guaranteed``, a stack corrects it by
-        its out-of-fold scores.
-
-        Args:
-            level: The probability of each interval by itself.
-            x: As in :meth:`credible_set`.
-            guaranteed: As in :meth:`credible_set`.
-            num_samples: The number of draws. At least one of them has to be beyond each
-                end. With ``guaranteed`` there are as many as the stack was scored
-                with.
-            seed: As in :meth:`credible_set`.
-
-        Returns:
-            The intervals, with ends of shape ``(d,)``, or ``(B, d)`` of a batch.
-        """
-        x, is_one = _checked(self, level, x, num_samples, 0 if guaranteed else 2)
-        guarantee, of_folds = None, []
-        with seeded(seed), torch.no_grad():
-            if guaranteed:
-                pairs, stacks = self._held_out()
-                guarantee, n = pairs.guarantee(level), len(pairs)
-                for number, stack in enumerate(stacks):
-                    draws = _draw(stack, pairs.num_draws, x).permute(1, 2, 0)
-                    scores = pairs.marginal[pairs.fold == number].T.to(draws.device)
-                    of_folds.append(marginal_ends(scores.expand(len(x), -1, -1), draws))
-                low, high = torch.cat(of_folds, dim=-1)
-                low = low.kthvalue(n + 1 - rank_needed(level, n)).values
-                high = high.kthvalue(rank_needed(level, n)).values
-                least, most = self.prior.bounds(low)
-                low, high = low.clamp(least, most), high.clamp(least, most)
-            else:
-                draws = _draw(self, num_samples, x).double().cpu().numpy()
-                tails = (1 - level) / 2, (1 + level) / 2
-                low, high = map(torch.from_numpy, np.quantile(draws, tails, axis=0))
-        low, high = (end[0] if is_one else end for end in (low.to(x), high.to(x)))
-        return CredibleIntervals(low, high, level, guarantee, self.parameter_names)
+            guarantee, low, high, rule = make(self, level, x, num_samples)
+        return CredibleSet(
+            level=level,
+            guarantee=guarantee,
+            low=low.to(x).reshape(shape),
+            high=high.to(x).reshape(shape),
+            rule=rule,
+            parameter_names=self.parameter_names,
+        )
 
     def _held_out(self) -> tuple[SetScores, Sequence[Any]]:
         """Return out-of-fold scores, and the stack that has not seen each fold."""
@@ -506,20 +355,50 @@ class MakesSets:
         )
 
 
-def _checked(
-    posterior: Any, level: Any, x: Any, num_samples: Any, num_ends: int
-) -> tuple[Tensor, bool]:
-    """Return observations ``(B, *event)``, and whether a single one was given."""
-    check("level", level, Level)
-    check("num_samples", num_samples, Count)
-    if num_samples < (needed := _round_up(num_ends / (1 - level))):
+def _of_draws(posterior: Any, level: float, x: Tensor, num_samples: int) -> Any:
+    """Return no guarantee, the ends of central intervals, and the rule of the set."""
+    if num_samples < (needed := _round_up(2 / (1 - level))):
         raise InvalidInputError(
             f"Expected `num_samples` of at least {needed} for a level of {level:g}, so "
             f"that a draw is beyond each end; got {num_samples}."
         )
-    event = posterior.posterior_estimator.condition_shape
-    is_one = x is None or np.ndim(x) == len(event)
-    return posterior._one_x(x) if is_one else posterior._batch_of_x(x), is_one
+    draws = _draw(posterior, num_samples, x)
+    tails = (1 - level) / 2, (1 + level) / 2
+    ends = np.quantile(draws.double().cpu().numpy(), tails, axis=0)
+
+    def rule(theta: Tensor) -> Tensor:
+        number = num_samples + 1 - _round_up(level * num_samples)
+        least = _log_prob(posterior, draws, x).kthvalue(number, keepdim=True).values
+        return (_log_prob(posterior, theta, x) >= least).T
+
+    return None, *map(torch.from_numpy, ends), rule
+
+
+def _guaranteed(posterior: Any, level: float, x: Tensor, num_samples: int) -> Any:
+    """Return the guarantee, the ends of intervals, and the rule of the set."""
+    pairs, stacks = posterior._held_out()
+    guarantee, rank = pairs.guarantee(level), rank_needed(level, len(pairs))
+    draws = [_draw(one, pairs.num_draws, x) for one in stacks]
+    of_folds = []
+    for number, own in enumerate(draws):
+        scores = pairs.marginal[pairs.fold == number].T.to(own.device)
+        scores = scores.expand(len(x), -1, -1)
+        of_folds.append(marginal_ends(scores, own.permute(1, 2, 0)))
+    low, high = torch.cat(of_folds, dim=-1)
+    low = low.kthvalue(len(pairs) + 1 - rank).values
+    high = high.kthvalue(rank).values
+    least, most = posterior.prior.bounds(low)
+
+    def rule(theta: Tensor) -> Tensor:
+        at_theta = [
+            joint_scores(_log_prob(one, theta, x), _log_prob(one, own, x))
+            for one, own in zip(stacks, draws, strict=True)
+        ]
+        scores = pairs.joint.to(x.device)
+        held = is_held(scores, pairs.fold, torch.stack(at_theta), rank=rank).T
+        return held & posterior.prior.inside(theta.flatten(0, 1)).view_as(held)
+
+    return guarantee, low.clamp(least, most), high.clamp(least, most), rule
 
 
 def _draw(posterior: Any, num_samples: int, x: Tensor) -> Tensor:
@@ -529,32 +408,3 @@ def _draw(posterior: Any, num_samples: int, x: Tensor) -> Tensor:
 def _log_prob(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
     """Return log densities up to the mass in the prior's support, ``(B, M)``."""
     return posterior.log_prob_batched(theta, x, norm_posterior=False).T
-
-
-def _spread(
-    posterior: Any, x: Tensor, num_samples: int
-) -> tuple[Tensor, Callable[[], Tensor]]:
-    r"""Return draws that reach further than the stack, and their log density.
-
-    .. math:: q(\theta) = \frac14 \Big( p(\theta) + \sum_{s \in \{1, 2, 4\}}
-        s^{-d}\, p\big(\mu + (\theta - \mu) / s \mid x\big) \Big)
-    """
-    prior, modules = posterior.prior, posterior.posterior_estimator.modules()
-    # Discrete parameters that are moved would be between the categories.
-    is_mixed = any(isinstance(module, MixedDensity) for module in modules)
-    stretches = STRETCHES[:1] if is_mixed else STRETCHES
-    count = math.ceil(num_samples / (1 + len(stretches)))
-    draws = _draw(posterior, count, x)
-    mean = draws.mean(dim=0)
-    of_prior = prior.sample((count, len(x))).to(draws)
-    theta = torch.cat([of_prior, *(mean.lerp(draws, s) for s in stretches)])
-
-    @torch.no_grad()
-    def log_density() -> Tensor:
-        terms = [prior.log_prob(theta).double()]
-        for s in stretches:
-            log_prob = posterior.log_prob_batched(mean.lerp(theta, 1 / s), x).double()
-            terms.append(log_prob - math.log(s) * theta.shape[-1])
-        return torch.stack(terms).logsumexp(dim=0) - math.log(len(terms))
-
-    return theta, log_density

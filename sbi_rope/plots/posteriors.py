@@ -32,6 +32,7 @@ from sbi_rope.plots._samples import (
 )
 from sbi_rope.stacking import StackedPosterior
 from sbi_rope.utils.errors import InvalidInputError, warn_user
+from sbi_rope.utils.seeds import seeded
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -105,21 +106,26 @@ def credible_set(
     x = posterior._one_x(x)[0]
     found = {}
     for name in list(SETS)[: 1 + isinstance(posterior, StackedPosterior)]:
-        options: dict[str, Any] = {"guaranteed": bool(found), "num_samples": 2000}
-        makers = posterior.credible_set, posterior.credible_intervals
         try:
-            found[name] = [make(level, x, seed=0, **options) for make in makers]
+            found[name] = posterior.credible_set(
+                level, x, guaranteed=bool(found), num_samples=2000, seed=0
+            )
         except InvalidInputError as error:
             if not found:
                 raise
             warn_user(f"No set with a guarantee is drawn. {error}")
-    points = torch.cat([one.draws for one, _ in found.values()])
-    samples = {name: points[one.contains(points)] for name, (one, _) in found.items()}
-    samples["posterior"] = next(iter(found.values()))[0].draws
+    with seeded(0):
+        draws = posterior.sample((2000,), x, show_progress_bars=False)
+        # A guaranteed set may reach further than the posterior.
+        from_prior = posterior.prior.sample((2000,)).to(draws)
+    mean = draws.mean(dim=0)
+    points = torch.cat([from_prior, *(mean.lerp(draws, s) for s in (1.0, 2.0, 4.0))])
+    samples = {name: points[one.contains(points)] for name, one in found.items()}
+    samples["posterior"] = draws
     names = posterior.parameter_names if parameter_names is None else parameter_names
     members, truth, labels = as_samples(samples, theta, names)
     draws = members.pop("posterior")
-    ends = {name: torch.stack([b.low, b.high]) for name, (_, b) in found.items()}
+    ends = {name: torch.stack([one.low, one.high]) for name, one in found.items()}
     shown = [central_interval(draws), *members.values(), *ends.values()]
     shown += [] if truth is None else [truth[None]]
     shown = torch.cat([one.to(draws) for one in shown]).nan_to_num(posinf=0, neginf=0)
@@ -132,7 +138,7 @@ def credible_set(
                 for value in end[:, pair[0]].tolist():
                     axes.axvline(value, **SETS[name], lw=1.8, markevery=[])
             continue
-        for name in sorted(found, key=lambda name: -found[name][0].volume):
+        for name in sorted(found, key=lambda name: -len(members[name])):
             colour, columns = SETS[name]["color"], members[name][:, pair].T.numpy()
             axes.scatter(*columns, s=5, color=colour, lw=0, rasterized=True)
     from matplotlib.lines import Line2D

@@ -328,7 +328,7 @@ def started(
         return flow.made_of([(0, 0)] * len(of_version)), numbers
     found = corrected(data, versions, space, learn_prior=learn_prior)
     if space == "embedding":
-        return found.flow.behind_one_net(of_version), numbers
+        return found.flow[of_version], numbers
     of_nets, nets = [min(v, len(found.flow.nets) - 1) for v in of_version], None
     if space == "tuned":
         of_parts = tuned(data, versions)

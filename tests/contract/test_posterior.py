@@ -1,17 +1,24 @@
 """MixturePosterior keeps the contract of sbi's posteriors, and adds a batch to it."""
 
 import itertools
+import math
 
 import numpy as np
 import pytest
 import torch
-from sbi.utils import BoxUniform
+from sbi.inference import EnsemblePosterior
+from sbi.utils import BoxUniform, MultipleIndependent
+from torch import Tensor
+from torch.distributions import (
+    Exponential,
+    Independent,
+    MultivariateNormal,
+    Normal,
+    constraints,
+)
 
 from sbi_rope.density import MixturePosterior, PriorPosterior
-from sbi_rope.utils.errors import (
-    InvalidInputError,
-    SamplingError,
-)
+from sbi_rope.utils.errors import InvalidInputError, SamplingError
 from tests.problems import gaussian_posterior
 
 QUIET = {"show_progress_bars": False}
@@ -132,19 +139,73 @@ def test_map_finds_the_mode() -> None:
         assert view.log_prob(mode) > best - 0.02
 
 
-# --- the batch ---
+# --- the batch, and ensembles ---
 
 
 def test_length_indexing_and_iteration_follow_the_batch() -> None:
     posterior = gaussian_posterior()
     assert len(posterior) == 5
-    assert torch.equal(posterior[3].default_x, posterior.x_o[3:4])
     assert torch.equal(posterior[-1].default_x, posterior.x_o[4:])
-    views = list(posterior)
-    assert len(views) == 5
     with pytest.raises(IndexError):
         posterior[5]
-    assert all(
-        torch.equal(view.default_x[0], x)
-        for view, x in zip(views, posterior.x_o, strict=True)
+    seen = torch.cat([view.default_x for view in posterior])
+    assert torch.equal(seen, posterior.x_o)
+
+
+def test_an_ensemble_of_sbi_averages_posteriors() -> None:
+    members, theta = [gaussian_posterior(x_o=torch.ones(5, 3)) for _ in range(2)], 0.2
+    weights, x = torch.tensor([0.7, 0.3]), torch.ones(1, 3)
+    ensemble = EnsemblePosterior(members, weights.tolist())
+    theta = torch.full((1, 2), theta)
+    each = torch.stack([member.log_prob(theta, x=x) for member in members])
+    expected = (each + weights.log()[:, None]).logsumexp(dim=0)
+    assert torch.allclose(ensemble.log_prob(theta, x=x), expected, atol=1e-5)
+    assert ensemble.sample((7,), x=x, **QUIET).shape == (7, 2)
+
+
+# --- the prior as a posterior ---
+
+
+def test_the_prior_ignores_x_and_has_its_own_density() -> None:
+    normal = Independent(Normal(torch.tensor([1.0, -2.0]), torch.tensor([0.5, 2.0])), 1)
+    samples = PriorPosterior(normal).sample_batched((4000,), torch.full((2, 1), 1e6))
+    assert torch.allclose(samples.mean(dim=0), normal.mean.expand(2, 2), atol=0.2)
+    assert torch.allclose(samples.std(dim=0), normal.stddev.expand(2, 2), rtol=0.1)
+    # Unlike sbi's own priors, this one raises outside its support.
+    law = Exponential(torch.ones(2), validate_args=True)
+    positive = Independent(law, 1, validate_args=True)
+    theta, posterior = positive.sample((6,)), PriorPosterior(positive)
+    expected = positive.log_prob(theta)
+    assert torch.equal(posterior.log_prob(theta), expected)
+    assert torch.equal(
+        posterior.log_prob_batched(theta, torch.zeros(6, 1))[0], expected
     )
+    assert posterior.log_prob(torch.tensor([[-0.5, 0.5]])) == -torch.inf
+
+
+def test_a_prior_of_independent_parts_can_be_drawn_and_evaluated_in_batches() -> None:
+    parts = [BoxUniform(torch.zeros(2), 2 * torch.ones(2)), Normal(torch.zeros(1), 1.0)]
+    posterior, x = PriorPosterior(MultipleIndependent(parts)), torch.zeros(3, 5)
+    theta = posterior.sample_batched((2, 4), x)
+    assert theta.shape == (2, 4, 3, 3)
+    assert posterior.sample((2, 4)).shape == (2, 4, 3)
+    expected = Normal(0.0, 1.0).log_prob(theta[0, ..., 2]) - math.log(4)
+    assert torch.allclose(posterior.log_prob_batched(theta[0], x), expected)
+
+
+def test_a_prior_that_sbi_cannot_transform_is_a_posterior() -> None:
+    class Disc(constraints.Constraint):
+        event_dim = 1
+
+        def check(self, value: Tensor) -> Tensor:
+            return value.norm(dim=-1) < 1
+
+    class OnDisc(MultivariateNormal):
+        support = Disc()  # to which torch has no bijection
+
+    prior = OnDisc(torch.zeros(2), 0.01 * torch.eye(2))
+    posterior = PriorPosterior(prior)
+    theta = posterior.sample_batched((4,), torch.zeros(3, 5))
+    found = posterior.log_prob_batched(theta, torch.zeros(3, 5))
+    assert torch.allclose(found, prior.log_prob(theta))
+    assert posterior.log_prob(torch.ones(1, 2)) == -torch.inf

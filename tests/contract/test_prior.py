@@ -133,7 +133,7 @@ def test_a_prior_of_sbi_works_from_end_to_end(name: str, tmp_path: Path) -> None
         assert prior.inside(samples.flatten(0, 1)).all()
         log_prob = posterior.log_prob_batched(samples, x[:4])
         assert torch.isfinite(log_prob).all()
-        interval = posterior.credible_intervals(0.9, x=x[0])
+        interval = posterior.credible_set(0.9, x=x[0])
         assert (interval.low < interval.high).all()
         file = tmp_path / f"{type(posterior).__name__}.pt"
         save(posterior, file)

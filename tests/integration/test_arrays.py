@@ -72,6 +72,6 @@ def test_a_table_is_put_in_the_order_of_the_first_one() -> None:
         found = posterior.log_prob(second, x_second.iloc[0])  # a row is a series
         assert torch.equal(found, posterior.log_prob(theta, x[0]))
         found_set = posterior.credible_set(0.5, x_second.iloc[0], seed=0)
-        drawn = table(found_set.draws, "ab")[["b", "a"]]
-        inside = found_set.contains(found_set.draws)
+        drawn = table(theta, "ab")[["b", "a"]]
+        inside = found_set.contains(theta)
         assert torch.equal(found_set.contains(drawn), inside)

@@ -87,9 +87,7 @@ def of_posterior(kind: str, make: Callable[[], Any]) -> dict[str, Call]:
         f"{kind}.log_prob_batched": lambda theta=THETA, x=X_O: make().log_prob_batched(
             theta, x=x
         ),
-        f"{kind}.credible_intervals": lambda x=X_O: make().credible_intervals(
-            0.9, x, **drawn
-        ),
+        f"{kind}.credible_set": lambda x=X_O: make().credible_set(0.9, x, **drawn),
         f"{kind}.credible_set.contains": lambda theta=THETA: (
             make().credible_set(0.9, X_O[0], **drawn).contains(theta)
         ),

@@ -30,9 +30,7 @@ def test_a_stack_has_a_credible_set_and_one_with_a_guarantee() -> None:
     assert len(figure.axes) == 3
     texts = ["90 %, of the posterior", "90 %, guaranteed", "truth"]
     assert legend_texts(figure.legends[0]) == texts
-    intervals = stack.credible_intervals(
-        0.9, x, guaranteed=True, num_samples=2000, seed=0
-    )
+    intervals = stack.credible_set(0.9, x, guaranteed=True, seed=0)
     drawn = [line.get_xdata()[0] for line in figure.axes[0].lines]
     for end in (intervals.low[0], intervals.high[0]):
         assert any(x == pytest.approx(float(end)) for x in drawn)
