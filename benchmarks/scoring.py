@@ -214,7 +214,7 @@ def _candidates(case: Case, posterior: StackedPosterior) -> dict[str, np.ndarray
     scores = torch.cat([report.log_scores, stack], dim=1)
     return {
         "candidates": np.array([*report.names, STACK]),
-        "weights": np.array([*report.weights.weights.tolist(), np.nan]),
+        "weights": np.array([*report.weights.tolist(), np.nan]),
         "held_out": (scores.mean(dim=0) + unit).cpu().numpy(),
         "held_out_error": (scores.std(dim=0) / len(scores) ** 0.5).cpu().numpy(),
         "test": (test.mean(dim=0) + unit).cpu().numpy(),

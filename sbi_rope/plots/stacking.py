@@ -15,7 +15,6 @@ from sbi_rope.plots._figures import (
     hide_frame,
 )
 from sbi_rope.stacking import LearningCurve, StackingReport
-from sbi_rope.stacking.sections import is_corrected
 from sbi_rope.utils.settings import check
 
 if TYPE_CHECKING:
@@ -108,7 +107,7 @@ def _draw_scores(
             fontsize=SMALL,
         )
     stacks = {"stack": report.held_out.lpp}
-    if is_corrected(report):
+    if report.is_corrected:
         # It is below the other, beside the candidates that it is compared with.
         uncorrected = report.held_out.mean(report.comparable_scores)
         stacks = {"stack, uncorrected": uncorrected, **stacks}

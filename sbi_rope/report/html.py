@@ -17,7 +17,7 @@ from sbi_rope.plots import (
     stacking_report,
 )
 from sbi_rope.stacking import StackingReport
-from sbi_rope.stacking.sections import METHODS, headline, sections_of
+from sbi_rope.stacking.report import METHODS, headline, sections_of
 from sbi_rope.utils.errors import InvalidInputError
 from sbi_rope.utils.settings import check, names_of
 
@@ -109,9 +109,7 @@ def write_html(
 
 def _parts(report: StackingReport, names: Sequence[str]) -> Iterable[_Part]:
     """Yield the sections of the printed report, with their tables and pictures."""
-    helped, trust, simulator, more = (
-        _Part(one.title, one.lines) for one in sections_of(report, names)
-    )
+    helped, trust, simulator, more = (_Part(*one) for one in sections_of(report, names))
     helped.heads = "candidate", "method", "weight", "nats a pair", "in prior units"
     helped.rows = [
         (

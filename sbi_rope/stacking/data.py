@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from sbi_rope.data.labels import nodes_of, reference_of
 from sbi_rope.data.pairs import Nodes
@@ -61,7 +61,7 @@ class StackData:
         self.rope, self.npe, self.show = rope, rope.npe, show_progress_bars
         self.estimator, self.source = estimator_of(self.npe), rope.source
         self.prior, self.pairs = PriorDistribution(self.npe.prior), rope.pairs
-        self.model = DiscrepancyModel()
+        self.model, self.embedding_net = DiscrepancyModel(), rope.embedding_net
         labels = len(self.pairs.label.group.unique())
         if (count := min(self.pairs.num_groups, labels)) < 2:
             raise NotReadyError(
@@ -70,6 +70,10 @@ class StackData:
             )
         of_folds, self.seed = draw_seeds(seed, 2)
         self.folds = self.pairs.folds(num_folds, seed=of_folds)
+        self.every = torch.cat(self.folds)
+        # Whether x is a vector of few entries, and neither a series nor an image.
+        x = self.pairs.x
+        self.is_short = x.ndim == 2 and x.shape[1] <= MAX_SUMMARIES
         self.kept: dict[Hashable, Any] = {}
 
     def __len__(self) -> int:
@@ -84,22 +88,16 @@ class StackData:
         used = sorted((fold + 1 + j) % count for j in range(num_folds))
         return torch.cat([self.folds[number] for number in used])
 
-    @property
-    def every(self) -> Tensor:
-        """The rows of all folds."""
-        return torch.cat(self.folds)
-
-    def parts(self, rows: Tensor) -> list[Tensor]:
-        """Cut rows into folds, of which one alone is divided further by groups."""
-        folds = [fold for fold in self.folds if torch.isin(fold, rows).all()]
-        if len(folds) > 1:
-            return folds
-        inner = self.pairs[rows].folds(NUM_INNER_FOLDS, seed=self.seed_of(rows))
-        return [rows[part] for part in inner]
-
     def holdouts(self, rows: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Return the rows to train on and those held out, for each part in turn."""
-        parts = self.parts(rows)
+        """Return the rows to train on and those held out, for each part in turn.
+
+        The parts are folds. A single fold is divided further by groups, and a single
+        group leaves nothing to hold out.
+        """
+        parts = [fold for fold in self.folds if torch.isin(fold, rows).all()]
+        if len(parts) < 2:
+            inner = self.pairs[rows].folds(NUM_INNER_FOLDS, seed=self.seed_of(rows))
+            parts = [rows[part] for part in inner]
         if len(parts) < 2:
             return []
         return [(rows[~torch.isin(rows, part)], part) for part in parts]
@@ -111,11 +109,6 @@ class StackData:
         return int(sequence.generate_state(1)[0])
 
     # --- simulations ---
-
-    @cached_property
-    def embedding_net(self) -> nn.Module:
-        """The embedding net h of NPE."""
-        return self.rope.embedding_net
 
     @cached_property
     def simulations(self) -> tuple[Tensor, Tensor]:
@@ -130,56 +123,42 @@ class StackData:
     def moments(self, rows: Tensor, space: Space) -> Moments:
         """Return moments of simulations at some pairs: of x with "input", else h(x)."""
         used = [k for k, fold in enumerate(self.folds) if torch.isin(fold, rows).any()]
-        parts = [self._moments(number, space) for number in used]
+        parts = [self._moments(k, of_x=space == "input") for k in used]
         found = Moments(
             means=torch.cat([part.means for part in parts]),
             covariance=torch.cat([part.covariance for part in parts]),
         )
-        of_found = torch.cat([self.folds[number] for number in used])
-        place = torch.zeros(len(self), dtype=torch.long, device=rows.device)
-        place[of_found] = torch.arange(len(of_found), device=rows.device)
-        return found[place[rows]]
+        if self.is_short:
+            width = self.embedded.shape[1]
+            both = slice(0, width), slice(width, None)
+            found = found.columns(both[space == "input"])
+        order = torch.cat([self.folds[k] for k in used])
+        return found[(rows[:, None] == order).long().argmax(dim=1)]
 
-    def _moments(self, fold: int, space: Space) -> Moments:
+    def _moments(self, fold: int, *, of_x: bool) -> Moments:
+        """Return moments at a fold: of h(x) and x side by side if x is short."""
         h, rows = self.embedding_net, self.folds[fold]
-        of_x = space == "input"
 
         def represent(x: Tensor) -> Tensor:
-            # Side by side if x is short, so that both are of the same simulations.
-            parts = [embed(h, x)] * (self.is_short or not of_x)
-            return torch.cat(parts + [x] * (self.is_short or of_x), dim=1)
+            if self.is_short:  # so that both are of the same simulations
+                return torch.cat([embed(h, x), x], dim=1)
+            return x if of_x else embed(h, x)
 
-        key = "moments", fold, self.is_short or of_x
+        key = "moments", fold, of_x and not self.is_short
         if key not in self.kept:
+            what = self.source, self.pairs[rows], SIMULATIONS_PER_PAIR, represent
             with seeded(self.seed_of(rows)):
-                self.kept[key] = moments(
-                    self.source,
-                    self.pairs[rows],
-                    SIMULATIONS_PER_PAIR,
-                    represent,
-                    progress=self.show,
-                )
-        width = self.embedded.shape[1]
-        if of_x:
-            return self.kept[key].columns(slice(width if self.is_short else 0, None))
-        return self.kept[key].columns(slice(0, width))
+                self.kept[key] = moments(*what, progress=self.show)
+        return self.kept[key]
 
     # --- what x is like ---
-
-    @property
-    def is_short(self) -> bool:
-        """Whether x is a vector of few entries, and neither a series nor an image."""
-        return self.pairs.x.ndim == 2 and self.pairs.x.shape[1] <= MAX_SUMMARIES
 
     @cached_property
     def compares_entries(self) -> bool:
         """Whether x is a short vector without missing entries, simulated or real."""
         # Missing entries (NaN) can be embedded, but not corrected.
-        return (
-            self.is_short
-            and bool(torch.isfinite(self.pairs.x).all())
-            and bool(torch.isfinite(self.simulations[1]).all())
-        )
+        every = self.pairs.x, self.simulations[1]
+        return self.is_short and all(bool(torch.isfinite(x).all()) for x in every)
 
     @property
     def reads_summaries(self) -> bool:
@@ -204,9 +183,7 @@ class StackData:
                 pairs.group,
                 seed=self.seed_of(rows),
             )
-        targets = found.new_zeros(len(self), found.shape[1])
-        targets[rows] = found
-        return targets
+        return found.new_zeros(len(self), found.shape[1]).index_copy(0, rows, found)
 
     @torch.no_grad()
     def nodes(self, rows: Tensor, start: Density) -> Nodes:

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from datetime import datetime, timezone
 from importlib.metadata import version
 from typing import Annotated, Any
 
@@ -16,12 +15,17 @@ from sbi_rope.metrics.statistics import TwoSampleTest, compare_with_pairs
 from sbi_rope.npe.sbi import check_density, embed, headless
 from sbi_rope.npe.standardisation import warn_of_far_entries
 from sbi_rope.rope.rope import RoPE
-from sbi_rope.stacking.candidates import as_densities, chosen_candidates, left_out
+from sbi_rope.stacking.candidates import (
+    Candidate,
+    GivenCandidate,
+    as_density,
+    default_candidates,
+)
 from sbi_rope.stacking.data import NUM_FOLDS, StackData, draw_seeds
 from sbi_rope.stacking.posterior import StackedPosterior, Versions
 from sbi_rope.stacking.report import LearningCurve, StackingReport
 from sbi_rope.stacking.scoring import score_folds
-from sbi_rope.utils.errors import warn_user
+from sbi_rope.utils.errors import InvalidInputError, warn_user
 from sbi_rope.utils.progress import is_shown
 from sbi_rope.utils.seeds import seeded
 from sbi_rope.utils.settings import Range, check, default_names
@@ -112,57 +116,48 @@ def stack(
         what="a RoPE of a posterior",
         because="candidates are scored by the density of held-out parameters",
     )
-    # These come first, so that nobody waits for the training to hear of it.
-    stacked = chosen_candidates(candidates, data, x_o)
+    known = default_candidates(x_o=x_o)
+    chosen = [candidate for candidate in known if candidate.suits(data)]
+    if candidates is not None:
+        chosen = _checked(candidates, data)
     batch = None if x_o is None else _compare_batch(data, x_o)
     # Versions are trained on all folds but one, and for the curve on fewer.
     num_folds = len(data.folds)
     smaller = {int(share * num_folds) for share in SMALLER if learning_curve}
     counts = {num_folds - 1, *(n for n in smaller if 0 < n < num_folds - 1)}
     points: list[StackingReport] = []
-    seconds = dict.fromkeys((candidate.name for candidate in stacked), 0.0)
     fitted: list[list[Density]] = []
     for count in sorted(counts, reverse=True):
         versions = [data.without(k, count) for k in range(num_folds)]
         if not fitted:
             versions.append(data.every)
-        found = []
-        for candidate in stacked:
-            # With the same seed for all, nothing depends on the order of candidates.
-            # The caller may have switched gradients off.
-            began = time.perf_counter()
-            with seeded(data.seed), torch.enable_grad():
-                densities = candidate.fit(data, versions)
-            seconds[candidate.name] += time.perf_counter() - began
-            found.append(as_densities(densities, data, candidate.name))
+        found = [_fitted(candidate, data, versions) for candidate in chosen]
         fitted = fitted or found
-        points.append(
-            score_folds(data, stacked, found, num_training_folds=count, seed=of_scores)
+        points.insert(
+            0,
+            score_folds(data, chosen, found, num_training_folds=count, seed=of_scores),
         )
-    slowest = sorted(seconds, key=lambda one: -seconds[one])[:3]
-    corrects = any("discrepancy" in candidate.family for candidate in stacked)
-    curve = None
-    if learning_curve:
-        curve = LearningCurve(
-            num_pairs=tuple(point.num_trained_on for point in points[::-1]),
-            evaluations=tuple(point.held_out for point in points[::-1]),
-        )
+    curve = LearningCurve(
+        num_pairs=tuple(point.num_trained_on for point in points),
+        evaluations=tuple(point.held_out for point in points),
+    )
+    corrects = any("discrepancy" in candidate.family for candidate in chosen)
+    names = [candidate.name for candidate in chosen]
+    left_out = [one.name for one in known if one.name not in names]
     report = replace(
-        points[0],
-        learning_curve=curve,
+        points[-1],
+        learning_curve=curve if learning_curve else None,
         batch=batch,
         discrepancy=data.discrepancy() if corrects and data.compares_entries else None,
         probability_of_prior=probability_of_prior(
             data.pairs, data.prior, seed=data.seed
         ),
-        keep_prior=tuple(one.name for one in stacked if not one.learns_prior),
+        keep_prior=tuple(one.name for one in chosen if not one.learns_prior),
         provenance={
             "seed": "none, so that a repetition differs" if seed is None else str(seed),
             "seconds": f"{time.perf_counter() - start:.0f}",
-            "longest": ", ".join(f"{name} {seconds[name]:.0f} s" for name in slowest),
-            **({"left out": left_out(stacked, x_o)} if candidates is None else {}),
+            **({} if candidates is not None else {"left out": "; ".join(left_out)}),
             "simulator calls": f"{rope.num_simulator_calls - calls:,}",
-            "finished": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
             "versions": ", ".join(f"{name} {version(name)}" for name in PACKAGES),
         },
     )
@@ -174,6 +169,36 @@ def stack(
     )
     posterior.parameter_names, posterior.x_names = rope.parameter_names, rope.x_names
     return posterior
+
+
+def _checked(candidates: Sequence[Any], data: StackData) -> list[Candidate]:
+    """Return the candidates of a user, densities among them as candidates."""
+    check("candidates", candidates, Sequence)
+    chosen = [
+        one if isinstance(one, Candidate) else GivenCandidate(one) for one in candidates
+    ]
+    names = [candidate.name for candidate in chosen]
+    if not names or len(set(names)) < len(names) or "stack" in names:
+        raise InvalidInputError(
+            "Expected `candidates` with different names, none of them 'stack'; got "
+            f"{names}. Name a density with `GivenCandidate(density, name)`."
+        )
+    for one in chosen:  # so that nobody waits for the training to hear of it
+        if isinstance(one, GivenCandidate):
+            as_density(one.density, data, one.name)
+    return chosen
+
+
+def _fitted(
+    candidate: Candidate, data: StackData, versions: Sequence[Tensor]
+) -> list[Density]:
+    """Return the density of each version of a candidate; equal ones are one object."""
+    # With the same seed for all, nothing depends on the order of candidates. The caller
+    # may have switched gradients off.
+    with seeded(data.seed), torch.enable_grad():
+        found = candidate.fit(data, versions)
+    known = {id(one): as_density(one, data, candidate.name) for one in found}
+    return [known[id(one)] for one in found]
 
 
 def _compare_batch(data: StackData, x_o: Tensor) -> TwoSampleTest | None:
