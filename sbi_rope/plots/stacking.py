@@ -107,9 +107,9 @@ def _draw_scores(
             fontsize=SMALL,
         )
     stacks = {"stack": report.held_out.lpp}
-    if report.is_corrected:
+    uncorrected = report.held_out.mean(report.comparable_scores)
+    if f"{uncorrected.mean:.2f}" != f"{report.held_out.lpp.mean:.2f}":
         # It is below the other, beside the candidates that it is compared with.
-        uncorrected = report.held_out.mean(report.comparable_scores)
         stacks = {"stack, uncorrected": uncorrected, **stacks}
     for position, (name, one) in enumerate(stacks.items(), start=len(found)):
         face = BLUE if name == "stack" else "white"

@@ -114,13 +114,7 @@ class GivenCandidate(Candidate):
 
 
 def as_density(own: Any, data: StackData, name: str) -> Density:
-    """Return a posterior or anything else as a density, tried on two pairs.
-
-    Raises:
-        InvalidInputError: If the shapes of what it returns do not fit.
-        UnsupportedPosteriorError: If it has no density, belongs to a batch, or has
-            other shapes of theta or x.
-    """
+    """Return a posterior or anything else as a density, tried on two pairs."""
     theta, x = data.pairs.mean[:2], data.pairs.x[:2]
     if isinstance(own, NeuralPosterior):
         if not getattr(own, "is_amortised", True):
@@ -260,11 +254,10 @@ def started(
 def tuned(
     data: StackData, versions: Sequence[Parts]
 ) -> tuple[Ensemble, list[int], list[Tensor]]:
-    """Tune nets with rehearsal on all parts of pairs that versions may see at once.
+    """Tune nets, with rehearsal, on what is seen when each part is held out.
 
-    Returns:
-        The nets; the number of that of each part; and for each version the embeddings
-        of pairs by nets that have not seen them.
+    There are also the number of the net of each part and, for each version, embeddings
+    of all pairs by nets that have not seen them.
     """
     sets = {key_of([seen]): seen for parts in versions for seen, _ in parts}
     with without_warning_of_few_pairs():
@@ -338,15 +331,12 @@ class FinetunedCandidate(CorrectingCandidate):
         starts: list[Density] = [flow[numbers] for numbers in members]
         jobs, of_version = [], []
         for version, rows in enumerate(versions):
-            nodes, splits = data.nodes(rows, starts[version]), data.holdouts(rows)
-            own = [
-                (number, split, nodes)
-                for number, split in zip(members[version], splits, strict=False)
-            ]
+            nodes = data.nodes(rows, starts[version])
+            own = [*zip(members[version], data.holdouts(rows), strict=False)]
             if self.rehearse and own:
                 own = [own[version % len(own)]]
             of_version.append([*range(len(jobs), len(jobs) + len(own))])
-            jobs += own
+            jobs += [(*job, nodes) for job in own]
         if not jobs:  # there is nothing to hold out
             return starts
         numbers, splits, labels = zip(*jobs, strict=True)
@@ -384,9 +374,6 @@ class UnlabelledCandidate(CorrectingCandidate):
         x_o: Real observations, shape ``(n_o, l)``, of which up to 200 are used. Those
             of the calibration pairs should not be among them, so that the scores are
             those of new observations. The stack may be asked about others, too.
-
-    Raises:
-        InvalidInputError: If x_o holds no numbers. Its shape is checked in the stack.
     """
 
     name = "discrepancy, with x_o"
@@ -500,17 +487,15 @@ def default_candidates(
         rope: A RoPE with its calibration pairs. Candidates that these data do not
             allow or need are left out, as in :func:`stack`. None returns all.
         x_o: Real observations without labels, shape ``(n_o, *event)``, other than those
-            of the pairs. They add a discrepancy that is learned from them, too, unless
-            they are fewer than 30 or no vectors of at most ten entries, or labels are
-            not exact.
+            of the pairs. They add a discrepancy that is learned from them, too, if they
+            are 30 vectors or more of at most ten entries, and labels are exact.
         learn_prior: Whether candidates may learn from the pairs how parameters are
             distributed. They should if the pairs are drawn like the observations to be
             inferred. With False, discrepancy models keep the prior of NPE, and others
             that are trained on pairs are left out.
 
     Raises:
-        InvalidInputError: If an argument has the wrong type, or, with a rope, x_o has
-            the wrong shape or device, is empty or not finite.
+        InvalidInputError: If x_o has the wrong shape, or is not finite.
         NotReadyError: If ``rope`` has fewer than two calibration pairs.
     """
     check("rope", rope, RoPE | None)

@@ -116,9 +116,6 @@ class StackedPosterior(MixturePosterior):
 
         Returns:
             Shape ``(n, K)``, float64, in the order of ``candidate_weights``.
-
-        Raises:
-            InvalidInputError: If shapes do not fit.
         """
         shape = self.posterior_estimator.input_shape
         theta = as_batch("theta", theta, shape, names=self.parameter_names)

@@ -17,17 +17,12 @@ from sbi_rope.metrics.evaluation import FEWEST, LEVEL, verdict_of
 from sbi_rope.metrics.statistics import Estimate, TwoSampleTest
 from sbi_rope.utils.settings import Count, check
 
-# A stack is called mostly one method if this has half of the weight.
-MOSTLY = 0.5
-# Sets of a higher level are not told apart from those that hold all draws.
-ALL = 0.995
 # How many more labels the learning curve is read for; and twice as many as there are.
 FEW_MORE = 10
-# A difference of less than this, in nats a pair, is slight: 10 % of the density.
-SLIGHT = 0.1
-# With a difference of so many nats, a network is far from anything that it has seen.
-INCOMPARABLE = 1e6
-# Weights below this, and so many entries of x, are not listed in the text.
+# A difference of less than this, in nats a pair, is slight: 10 % of the density. With
+# one of so many, a network is far from anything that it has seen.
+SLIGHT, INCOMPARABLE = 0.1, 1e6
+# Smaller weights, and more entries of x, are not listed in the text.
 SMALL_WEIGHT, MAX_ENTRIES = 0.005, 5
 
 REFERENCES = {"prior": "the prior", "NPE": "NPE as it was"}
@@ -109,7 +104,8 @@ class StackingReport:
     A candidate is scored at pairs of a fold by the version that was trained without
     this fold, and the stack at these pairs has the weights fitted to the other folds.
     With few pairs these weights still depend a little on the labels of the fold. What
-    is deployed is the average of all versions. Print the report for what it found.
+    is deployed is the average of all versions, which is usually a little wider. Print
+    the report for what it found.
 
     With labels that are not exact, scores are log densities of the labels, and ranks
     are those of the labels, NaN where a parameter was not measured. Scores of labels
@@ -124,7 +120,6 @@ class StackingReport:
         comparable_scores: That under the stack, not corrected either, shape ``(n,)``.
             For NPE on real data the correction may not end.
         fold: The fold of each pair, shape ``(n,)``.
-        num_trained_on: The mean number of pairs that the candidates were trained on.
         held_out: The scores of the stack at all pairs. Its density is normalised inside
             the support of the prior.
         set_scores: The scores that sets with a guarantee are made from; None if no
@@ -149,7 +144,6 @@ class StackingReport:
     log_scores: Tensor = field(repr=False)
     comparable_scores: Tensor = field(repr=False)
     fold: Tensor = field(repr=False)
-    num_trained_on: int
     held_out: Evaluation
     set_scores: SetScores | None = field(default=None, repr=False)
     labels: str = ""
@@ -160,9 +154,6 @@ class StackingReport:
     probability_of_prior: float | None = None
     keep_prior: tuple[str, ...] = ()
     provenance: dict[str, str] = field(default_factory=dict, repr=False)
-
-    def __len__(self) -> int:
-        return len(self.fold)
 
     @property
     def gains(self) -> dict[str, Estimate]:
@@ -180,12 +171,6 @@ class StackingReport:
                 # Where both are minus infinity, neither is better.
                 gains[name] = self.held_out.mean(gain.where(~gain.isnan(), 0.0))
         return gains
-
-    @property
-    def is_corrected(self) -> bool:
-        """Whether the correction for mass outside the prior changes the score."""
-        comparable = self.held_out.mean(self.comparable_scores)
-        return f"{self.held_out.lpp.mean:.2f}" != f"{comparable.mean:.2f}"
 
     def as_rows(self) -> list[dict[str, Any]]:
         """Return a row for each candidate, the best out-of-fold score first.
@@ -230,8 +215,8 @@ def headline(report: StackingReport) -> str:
     group = report.held_out.group
     groups = "" if group is None else f" in {len(group.unique())} groups"
     return (
-        f"Stack of {len(report.names)} candidates, scored on {len(report)} hold-out "
-        f"calibration pairs{groups}"
+        f"Stack of {len(report.names)} candidates, scored on {len(report.fold)} "
+        f"hold-out calibration pairs{groups}"
     )
 
 
@@ -295,7 +280,7 @@ def _weights(report: StackingReport) -> Line:
         if weight >= SMALL_WEIGHT:
             listed.append(f"{family} {weight:.0%}{several}")
     family, weight = next(iter(totals.items()))
-    if weight < MOSTLY:
+    if weight < 0.5:
         return f"No method has half of the weight: {'; '.join(listed)}.", False
     text = f"Weights: {'; '.join(listed)}."
     if family in METHODS:
@@ -318,18 +303,13 @@ def _trust(report: StackingReport, names: Sequence[str] | None) -> Iterator[Line
     ):
         advice = "Collect more labels, or ask for intervals with `guaranteed=True`."
         yield advice, True
-    text = (
-        f"These are scores of versions trained on {report.num_trained_on} pairs. Their "
-        "average is deployed, which is usually a little wider."
-    )
-    yield text, False
     if is_improbable(report.probability_of_prior):
         yield _prior(report), True
     scores = report.set_scores
     if scores is not None and rank_needed(LEVEL, len(scores)) <= len(scores):
         needed = scores.level_needed(LEVEL)
         size = f"as large as the posterior's own {needed:.0%} sets"
-        if needed > ALL:
+        if needed > 0.995:
             size = "larger than almost all draws"
         text = (
             f"{LEVEL:.0%} sets of all parameters together hold "

@@ -33,7 +33,6 @@ def score_folds(
     candidates: Sequence[Candidate],
     fitted: Sequence[Sequence[Density]],
     *,
-    num_training_folds: int,
     seed: int,
 ) -> StackingReport:
     """Score what was trained without each fold on the pairs of the fold.
@@ -42,7 +41,6 @@ def score_folds(
         data: The pairs and their folds.
         candidates: What the columns of the scores are called.
         fitted: The densities of each candidate, of which number k has not seen fold k.
-        num_training_folds: The number of folds that each was trained on.
         seed: Seed of the draws at the held-out pairs.
     """
     pairs, weight = data.pairs, data.pairs.shared_weight
@@ -69,10 +67,10 @@ def score_folds(
             ) from error
         parts.append((log_prob - log_mass, *drawn))
     order = torch.cat(data.folds).argsort()
-    log_prob, estimates, ranks, *of_sets = (
+    log_prob, estimates, ranks, joint, marginal = (
         torch.cat(column)[order] for column in zip(*parts, strict=True)
     )
-    is_simple = pairs.are_exact and bool((pairs.weight == 1).all())
+    are_plain = pairs.are_exact and bool((pairs.weight == 1).all())
     return StackingReport(
         names=tuple(candidate.name for candidate in candidates),
         families=tuple(one.family or one.name for one in candidates),
@@ -80,7 +78,6 @@ def score_folds(
         log_scores=log_scores,
         comparable_scores=(log_scores + weights[fold].log()).logsumexp(dim=1),
         fold=fold,
-        num_trained_on=len(fold) * num_training_folds // len(data.folds),
         held_out=Evaluation(
             log_prob=log_prob,
             ranks=ranks,
@@ -90,8 +87,8 @@ def score_folds(
             group=pairs.group if pairs.num_groups < len(pairs) else None,
             parameter_names=data.rope.parameter_names,
         ),
-        set_scores=_set_scores(data, *of_sets, fold, weights, seed=seed),
-        labels="" if is_simple else str(pairs),
+        set_scores=_set_scores(data, joint, marginal, fold, weights, seed=seed),
+        labels="" if are_plain else str(pairs),
         are_exact=pairs.are_exact,
     )
 

@@ -57,26 +57,23 @@ def stack(
     fold, and one trained on all pairs. By Jensen's inequality the average has a higher
     expected score than single versions, for observations like those of the pairs.
 
-    Weights, scores and calibration in the report hold for such observations. If you
-    pass ``x_o``, it is compared with the pairs by an energy test of the embeddings, and
-    a p-value below 0.01 gives a warning. :func:`~sbi_rope.diagnose` makes the same
-    comparison.
+    Weights, scores and calibration in the report hold for such observations.
 
     Args:
         rope: A RoPE with calibration pairs. It need not be trained. Only its counts of
             calls of the simulator and of dropped simulations change.
         x_o: Real observations without labels, shape ``(n_o, *event)``, other than those
-            of the pairs. A default candidate learns its discrepancy from them, too, if
-            they are 30 vectors or more of at most ten entries.
+            of the pairs. They are compared with the pairs by an energy test of the
+            embeddings, and a p-value below 0.01 gives a warning. A default candidate
+            learns its discrepancy from them, too, if they are 30 vectors or more of at
+            most ten entries.
         candidates: What to stack;
             :func:`default_candidates(rope, x_o)
-            <sbi_rope.stacking.default_candidates>` if None: the prior, NPE, fine-tuned
-            NPE, discrepancy models and regressions. A posterior, or a density of your
-            own, that has not seen the pairs is taken as it is, see
+            <sbi_rope.stacking.default_candidates>` if None. A posterior, or a density
+            of your own, that has not seen the pairs is taken as it is, see
             :class:`~sbi_rope.stacking.GivenCandidate`.
-        num_folds: The number of folds, at most the number of groups. Pairs of
-            one group are in the same fold. Groups are those that were appended, or else
-            pairs with equal labels.
+        num_folds: The number of folds, at most the number of groups. Pairs of one group
+            are in the same fold.
         learning_curve: Whether to train on fewer folds too, so that the report can
             estimate what more labels would add. It takes about twice the time.
         seed: Seed of everything random; None uses the states of torch, NumPy and
@@ -89,13 +86,10 @@ def stack(
 
     Raises:
         NotReadyError: If there are fewer than two groups of pairs.
-        InvalidInputError: If an argument is outside its range or has the wrong shape,
-            or if a candidate with ``space="input"`` corrects x and some of its entries
-            are missing (NaN).
+        InvalidInputError: If an argument is outside its range or has the wrong shape.
         UnsupportedPosteriorError: If NPE or a candidate has no density.
         SamplingError: If the candidates have almost no mass inside the support of the
             prior at a hold-out observation.
-        SimulationError: If the simulator fails.
     """
     check("rope", rope, RoPE)
     check("num_folds", num_folds, Annotated[int, Range(2)])
@@ -116,16 +110,17 @@ def stack(
         what="a RoPE of a posterior",
         because="candidates are scored by the density of held-out parameters",
     )
-    known = default_candidates(x_o=x_o)
-    chosen = [candidate for candidate in known if candidate.suits(data)]
-    if candidates is not None:
-        chosen = _checked(candidates, data)
+    if candidates is None:
+        known = default_candidates(x_o=x_o)
+        chosen = [one for one in known if one.suits(data)]
+    else:
+        known = chosen = _checked(candidates, data)
     batch = None if x_o is None else _compare_batch(data, x_o)
     # Versions are trained on all folds but one, and for the curve on fewer.
     num_folds = len(data.folds)
     smaller = {int(share * num_folds) for share in SMALLER if learning_curve}
     counts = {num_folds - 1, *(n for n in smaller if 0 < n < num_folds - 1)}
-    points: list[StackingReport] = []
+    points: dict[int, StackingReport] = {}
     fitted: list[list[Density]] = []
     for count in sorted(counts, reverse=True):
         versions = [data.without(k, count) for k in range(num_folds)]
@@ -133,19 +128,14 @@ def stack(
             versions.append(data.every)
         found = [_fitted(candidate, data, versions) for candidate in chosen]
         fitted = fitted or found
-        points.insert(
-            0,
-            score_folds(data, chosen, found, num_training_folds=count, seed=of_scores),
-        )
+        points[count] = score_folds(data, chosen, found, seed=of_scores)
     curve = LearningCurve(
-        num_pairs=tuple(point.num_trained_on for point in points),
-        evaluations=tuple(point.held_out for point in points),
+        num_pairs=tuple(len(data) * count // num_folds for count in sorted(counts)),
+        evaluations=tuple(points[count].held_out for count in sorted(counts)),
     )
     corrects = any("discrepancy" in candidate.family for candidate in chosen)
-    names = [candidate.name for candidate in chosen]
-    left_out = [one.name for one in known if one.name not in names]
     report = replace(
-        points[-1],
+        points[num_folds - 1],
         learning_curve=curve if learning_curve else None,
         batch=batch,
         discrepancy=data.discrepancy() if corrects and data.compares_entries else None,
@@ -156,7 +146,7 @@ def stack(
         provenance={
             "seed": "none, so that a repetition differs" if seed is None else str(seed),
             "seconds": f"{time.perf_counter() - start:.0f}",
-            **({} if candidates is not None else {"left out": "; ".join(left_out)}),
+            "left out": "; ".join(c.name for c in known if c not in chosen) or "none",
             "simulator calls": f"{rope.num_simulator_calls - calls:,}",
             "versions": ", ".join(f"{name} {version(name)}" for name in PACKAGES),
         },
@@ -178,10 +168,10 @@ def _checked(candidates: Sequence[Any], data: StackData) -> list[Candidate]:
         one if isinstance(one, Candidate) else GivenCandidate(one) for one in candidates
     ]
     names = [candidate.name for candidate in chosen]
-    if not names or len(set(names)) < len(names) or "stack" in names:
+    if not names or len(set(names)) < len(names):
         raise InvalidInputError(
-            "Expected `candidates` with different names, none of them 'stack'; got "
-            f"{names}. Name a density with `GivenCandidate(density, name)`."
+            f"Expected `candidates` with different names; got {names}. Name a density "
+            "with `GivenCandidate(density, name)`."
         )
     for one in chosen:  # so that nobody waits for the training to hear of it
         if isinstance(one, GivenCandidate):

@@ -78,6 +78,7 @@ def stacking_weights(
     density = (scores - scores.max(dim=1, keepdim=True).values).exp()
     total, share = float(count.sum()) + PSEUDO_COUNT, PSEUDO_COUNT / density.shape[1]
     weights = density.new_full((density.shape[1],), 1.0 / density.shape[1])
+    gap = 0.0
     for _ in range(MAX_STEPS):
         # The derivative of the objective by the weight of each candidate.
         ratio = density / (density @ weights)[:, None]
