@@ -216,12 +216,10 @@ def started(
         z = [of_pairs[rows] for of_pairs, rows in zip(z, versions, strict=True)]
     else:
         net = network_of(data.estimator, space)
-        z = [embed(net, data.pairs.x[rows]) for rows in versions]
-    z_s = data.embedded
-    if space == "input":
-        as_batch("x", data.pairs.x)  # which may hold NaN otherwise
-        z_s = as_batch("x of simulations", data.simulations[1])
-    simulations = data.simulations[0], z_s
+        # What the net reads may hold NaN.
+        z = [as_batch("x", embed(net, data.pairs.x[rows])) for rows in versions]
+    z_s = data.simulations[1] if space == "input" else data.embedded
+    simulations = data.simulations[0], as_batch("x of simulations", z_s)
     fitted: list[Version] = [
         fit_version(
             data.pairs[rows],
