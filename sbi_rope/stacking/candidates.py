@@ -203,8 +203,8 @@ def started(
     # A single person is both seen and held out.
     parts = [data.holdouts(rows) or [(rows, rows)] for rows in versions]
     of_version = [v for v, some in enumerate(parts) for _ in some]
-    every = torch.arange(len(of_version)).split([len(some) for some in parts])
-    numbers = [some.tolist() for some in every]
+    each = torch.arange(len(of_version)).split([*map(len, parts)])
+    numbers = [some.tolist() for some in each]
     if space is None:
         flow = Flow.of([data.estimator])
         return flow.made_of([(0, 0)] * len(of_version)), numbers

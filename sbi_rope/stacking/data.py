@@ -133,7 +133,9 @@ class StackData:
             both = slice(0, width), slice(width, None)
             found = found.columns(both[space == "input"])
         order = torch.cat([self.folds[k] for k in used])
-        return found[(rows[:, None] == order).long().argmax(dim=1)]
+        place = torch.empty_like(self.every)
+        place[order] = torch.arange(len(order), device=order.device)
+        return found[place[rows]]
 
     def _moments(self, fold: int, *, of_x: bool) -> Moments:
         """Return moments at a fold: of h(x) and x side by side if x is short."""
@@ -150,8 +152,6 @@ class StackData:
             with seeded(self.seed_of(rows)):
                 self.kept[key] = moments(*what, progress=self.show)
         return self.kept[key]
-
-    # --- what x is like ---
 
     @cached_property
     def compares_entries(self) -> bool:
@@ -208,10 +208,7 @@ class StackData:
         return Nodes(theta=theta, log_weights=log_weights)
 
     def discrepancy(self) -> DiscrepancyReport:
-        """Return what all pairs say about each entry of x, which is a short vector.
-
-        It needs no simulations beyond those of the candidates.
-        """
+        """Return what all pairs say about each entry of x, which is a short vector."""
         return report_discrepancy(
             self.pairs.x,
             self.moments(self.every.sort().values, "input"),

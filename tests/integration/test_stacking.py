@@ -294,6 +294,26 @@ def test_a_stack_changes_nothing_that_it_is_given_and_follows_from_its_seed() ->
     assert torch.equal(found, expected)
 
 
+def test_a_seed_gives_the_scores_and_weights_that_it_gave_before() -> None:
+    report = the_stack().report
+    recorded = {
+        "prior": (-1.386, 0.026),
+        "NPE": (-1.554, 0.009),
+        "fine-tuned NPE": (-1.554, 0.009),
+        "discrepancy": (-1.538, 0.009),
+        "discrepancy (input)": (-1.549, 0.009),
+        "discrepancy (input), fine-tuned": (-1.549, 0.009),
+        "regression": (0.713, 0.359),
+        "regression (embedding)": (0.943, 0.569),
+    }
+    columns = torch.stack([report.log_scores.mean(dim=0), report.weights], dim=1)
+    found = dict(zip(report.names, columns.tolist(), strict=True))
+    for name, numbers in recorded.items():
+        assert found.pop(name) == pytest.approx(numbers, abs=0.02), name
+    assert not found
+    assert report.held_out.lpp.mean == pytest.approx(0.898, abs=0.02)
+
+
 def test_without_a_seed_the_state_of_torch_decides() -> None:
     found = []
     for state in (5, 5, 6):
