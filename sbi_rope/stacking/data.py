@@ -27,9 +27,8 @@ from sbi_rope.utils.seeds import seeded
 NUM_SIMULATIONS, SIMULATIONS_PER_PAIR = 10_000, 100
 # A vector x with more entries is not treated as a list of summaries.
 MAX_SUMMARIES = 20
-# Samples of an estimator that is trained on labels that are not exact, and the nodes at
-# which their density is computed.
-NUM_SAMPLES, NUM_NODES = 200, 64
+# Samples of a density at each label that is not exact, from which nodes are placed.
+NUM_SAMPLES = 200
 # Folds of the calibration pairs, and parts of a single fold, a net without each of
 # which is trained.
 NUM_FOLDS, NUM_INNER_FOLDS = 5, 5
@@ -186,26 +185,18 @@ class StackData:
         return found.new_zeros(len(self), found.shape[1]).index_copy(0, rows, found)
 
     @torch.no_grad()
-    def nodes(self, rows: Tensor, start: Density) -> Nodes:
-        """Return nodes to compute the density of labels at, of use for these rows only.
+    def nodes(self, rows: Tensor, near: Sequence[Density], num_nodes: int) -> Nodes:
+        """Return nodes to compute the density of labels at, near samples of densities.
 
-        The density that is trained may move away from its ``start``, so that the nodes
-        spread as far as the prior does.
+        They also spread as far as the prior does. Of exact labels there is one node.
         """
+        x, size = self.pairs.x[rows], torch.Size((NUM_SAMPLES,))
         if self.pairs.are_exact:
-            return Nodes.exact(self.pairs.mean)
+            return Nodes.exact(self.pairs.mean[rows])
         with seeded(self.seed_of(rows)):
-            samples = start.sample(torch.Size((NUM_SAMPLES,)), self.pairs.x[rows])
-            found = nodes_of(
-                self.pairs.label[rows],
-                [reference_of(samples)],
-                self.prior,
-                num_nodes=NUM_NODES,
-            )
-        theta = found.theta[:1].expand(len(self), -1, -1).clone()
-        log_weights = found.log_weights[:1].expand(len(self), -1).clone()
-        theta[rows], log_weights[rows] = found.theta, found.log_weights
-        return Nodes(theta=theta, log_weights=log_weights)
+            references = [reference_of(one.sample(size, x)) for one in near]
+            labels = self.pairs.label[rows]
+            return nodes_of(labels, references, self.prior, num_nodes=num_nodes)
 
     def discrepancy(self) -> DiscrepancyReport:
         """Return what all pairs say about each entry of x, which is a short vector."""

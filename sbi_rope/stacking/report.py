@@ -135,7 +135,8 @@ class StackingReport:
             drawn from the prior, see :func:`~sbi_rope.discrepancy.learn_parameters`.
         keep_prior: The names of the candidates that do not learn from the pairs how
             parameters are distributed.
-        provenance: How it was made, in words: seed, seconds, simulator calls, versions.
+        provenance: How it was made, in words: seed, seconds, simulator calls, and the
+            default candidates that the data do not allow.
     """
 
     names: tuple[str, ...]
@@ -352,8 +353,7 @@ def _simulator(report: StackingReport) -> Iterator[Line]:
     if (found := report.discrepancy) is None:
         text = (
             "Not tested: x is no complete vector of at most 20 numbers, or no "
-            "discrepancy model is in the stack. `DiscrepancyNPE.from_posterior(...)"
-            ".report()` compares longer ones, and summaries of series and images."
+            "discrepancy model is in the stack. `DiscrepancyNPE` compares longer ones."
         )
         yield text, False
         return

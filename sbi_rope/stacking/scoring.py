@@ -5,8 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from sbi_rope.data.labels import nodes_of, reference_of
-from sbi_rope.data.pairs import Labels, Nodes, groups_of, one_of_each_group
+from sbi_rope.data.pairs import Labels, groups_of, one_of_each_group
 from sbi_rope.density import Density, MixturePosterior
 from sbi_rope.density.base import without_nan
 from sbi_rope.density.sets import SetScores, joint_scores, marginal_scores
@@ -22,9 +21,8 @@ from sbi_rope.utils.seeds import seeded
 
 # Samples at each held-out pair, from which the calibration of the stack is computed.
 NUM_SAMPLES = 250
-# Of labels that are not exact: samples of each candidate at each observation, from
-# which nodes are placed, and the nodes of each label.
-NUM_REFERENCES, NUM_NODES = 200, 512
+# Nodes at which the density of a label is computed that is not exact.
+NUM_NODES = 512
 
 
 @torch.no_grad()
@@ -47,9 +45,15 @@ def score_folds(
     folds = [(rows, [one[k] for one in fitted]) for k, rows in enumerate(data.folds)]
     log_scores = weight.new_empty(len(data), len(fitted))
     fold = torch.empty_like(pairs.group)
-    at_labels = [_at_labels(data, *one) for one in folds]
-    for k, (nodes, log_q) in enumerate(at_labels):
-        fold[data.folds[k]], log_scores[data.folds[k]] = k, nodes.log_mean(log_q)
+    at_labels = []
+    for k, (rows, densities) in enumerate(folds):
+        # Nodes come from the samples of each candidate, so that none is scored at
+        # parameters that only others consider plausible.
+        nodes, x = data.nodes(rows, densities, NUM_NODES), pairs.x[rows]
+        theta = nodes.theta.movedim(1, 0)
+        log_q = [without_nan(one.log_prob(theta, x)).double().T for one in densities]
+        at_labels.append((nodes, torch.stack(log_q, dim=2)))
+        fold[rows], log_scores[rows] = k, nodes.log_mean(at_labels[k][1])
     weights = fold_weights(log_scores, fold, weight)
     parts = []
     for (rows, densities), (nodes, log_q), own in zip(
@@ -70,6 +74,17 @@ def score_folds(
     log_prob, estimates, ranks, joint, marginal = (
         torch.cat(column)[order] for column in zip(*parts, strict=True)
     )
+    set_scores, rows = None, pairs.label.is_exact.nonzero().flatten()
+    if len(rows):  # for sets with a guarantee, one of each group counts
+        groups = groups_of(pairs.group[rows])
+        rows = rows[one_of_each_group(groups, seed=seed).to(rows.device)]
+        set_scores = SetScores(
+            joint=joint[rows],
+            marginal=marginal[rows],
+            fold=fold[rows],
+            weights=weights,
+            num_draws=NUM_SAMPLES,
+        )
     are_plain = pairs.are_exact and bool((pairs.weight == 1).all())
     return StackingReport(
         names=tuple(candidate.name for candidate in candidates),
@@ -87,33 +102,10 @@ def score_folds(
             group=pairs.group if pairs.num_groups < len(pairs) else None,
             parameter_names=data.rope.parameter_names,
         ),
-        set_scores=_set_scores(data, joint, marginal, fold, weights, seed=seed),
+        set_scores=set_scores,
         labels="" if are_plain else str(pairs),
         are_exact=pairs.are_exact,
     )
-
-
-def _at_labels(
-    data: StackData, rows: Tensor, densities: Sequence[Density]
-) -> tuple[Nodes, Tensor]:
-    """Return nodes of the labels of a fold, and log densities there, ``(n, S, K)``.
-
-    Nodes come from the samples of each candidate, so that none is scored at parameters
-    that only others consider plausible.
-    """
-    x, nodes = data.pairs.x[rows], Nodes.exact(data.pairs.mean[rows])
-    if not data.pairs.are_exact:
-        size = torch.Size((NUM_REFERENCES,))
-        with seeded(data.seed_of(rows)):
-            nodes = nodes_of(
-                data.pairs.label[rows],
-                [reference_of(one.sample(size, x)) for one in densities],
-                data.prior,
-                num_nodes=NUM_NODES,
-            )
-    theta = nodes.theta.movedim(1, 0)
-    log_q = [without_nan(one.log_prob(theta, x)).double().T for one in densities]
-    return nodes, torch.stack(log_q, dim=2)
 
 
 @torch.no_grad()
@@ -144,31 +136,6 @@ def scores_of_draws(
     known = labels.is_measured & (not labels.are_drawn)
     ranks = ranks.to(labels.y).where(known, torch.nan)
     return estimates.to(labels.y), ranks, joint, marginal
-
-
-def _set_scores(
-    data: StackData,
-    joint: Tensor,
-    marginal: Tensor,
-    fold: Tensor,
-    weights: Tensor,
-    *,
-    seed: int,
-) -> SetScores | None:
-    """Return what sets with a guarantee are made from; None without exact labels."""
-    is_counted = data.pairs.label.is_exact.cpu()
-    if not is_counted.any():
-        return None
-    groups = groups_of(data.pairs.group.cpu()[is_counted])
-    is_counted[is_counted.clone()] = one_of_each_group(groups, seed=seed)
-    rows = is_counted.to(fold.device)
-    return SetScores(
-        joint=joint[rows],
-        marginal=marginal[rows],
-        fold=fold[rows],
-        weights=weights,
-        num_draws=NUM_SAMPLES,
-    )
 
 
 def _log_unit(data: StackData) -> float | Tensor:

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from importlib.metadata import version
 from typing import Annotated, Any
 
 import torch
@@ -32,8 +31,6 @@ from sbi_rope.utils.settings import Range, check
 
 # The learning curve trains on these shares of the folds, and on all folds but one.
 SMALLER = (0.25, 0.5)
-# The report says which versions of these made it.
-PACKAGES = "sbi-rope", "sbi", "torch", "numpy", "scipy", "POT"
 
 
 def stack(
@@ -148,7 +145,6 @@ def stack(
             "seconds": f"{time.perf_counter() - start:.0f}",
             "left out": "; ".join(c.name for c in known if c not in chosen) or "none",
             "simulator calls": f"{rope.num_simulator_calls - calls:,}",
-            "versions": ", ".join(f"{name} {version(name)}" for name in PACKAGES),
         },
     )
     posterior = StackedPosterior(

@@ -100,9 +100,9 @@ def fold_weights(
     log_scores: Tensor, fold: Tensor, weight: Tensor | None = None
 ) -> Tensor:
     """Return the weights fitted without each of the F folds, shape ``(F, K)``."""
-    found = []
-    for number in range(int(fold.max()) + 1):
-        rows = fold != number
-        of_pairs = None if weight is None else weight[rows]
-        found.append(stacking_weights(log_scores[rows], pair_weights=of_pairs))
+    weight = torch.ones_like(log_scores[:, 0]) if weight is None else weight
+    others = [fold != number for number in range(int(fold.max()) + 1)]
+    found = [
+        stacking_weights(log_scores[rows], pair_weights=weight[rows]) for rows in others
+    ]
     return torch.stack(found).to(log_scores)

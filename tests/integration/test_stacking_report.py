@@ -171,14 +171,6 @@ def test_weights_of_families_are_summed_and_explained() -> None:
 # Calibration --------------------------------------------------------------------------
 
 
-def test_calibration_is_that_of_hold_out_pairs() -> None:
-    held_out = the_stack().report.held_out
-    text = flat(the_stack().report)
-    assert f"ACAUC {held_out.acauc:+.3f}" in text
-    inside = (held_out.levels <= 0.9).double().mean()
-    assert f"90% intervals {inside:.0%}." in text
-
-
 def test_estimates_and_ranks_are_those_of_hold_out_pairs() -> None:
     with quick(), patch("sbi_rope.stacking.scoring.NUM_SAMPLES", 400):
         report = stack(rope_of(), **DEFAULTS).report
@@ -188,6 +180,7 @@ def test_estimates_and_ranks_are_those_of_hold_out_pairs() -> None:
         [held_out.ranks.flatten(), (theta - held_out.estimates).flatten()]
     )
     assert float(above.double().corrcoef()[0, 1]) > 0.7
+    assert f"ACAUC {held_out.acauc:+.3f}" in flat(report)
 
 
 def test_the_text_says_what_to_do_about_over_confidence() -> None:
@@ -196,40 +189,17 @@ def test_the_text_says_what_to_do_about_over_confidence() -> None:
     assert "Collect more labels" not in flat(made_up(n=400))
 
 
-def test_parameters_that_are_not_calibrated_by_themselves_are_named() -> None:
-    """One is over-confident and one too wide, so that their mean looks calibrated."""
-    levels = torch.rand(400, 2, generator=torch.Generator().manual_seed(0))
-    opposite = torch.stack([levels[:, 0].sqrt(), levels[:, 1].square()], dim=1)
-    text = flat(made_up(n=400, ranks=(1 + opposite) / 2))
-    assert "Calibrated, on average over parameters, as far as 400 obs" in text
-    assert "theta_1 alone is over-confident: ACAUC +0.1" in text
-    assert "theta_2 alone is too wide: ACAUC -0.1" in text
-
-
-def test_the_text_names_what_calibration_assumes_about_a_batch() -> None:
-    report = made_up()
-    assert "`diagnose(rope, x_o, posterior=posterior)` tests others" in flat(report)
-    like, unlike = (
-        flat(replace(report, batch=TwoSampleTest(p_value=p, spread=0.4)))
-        for p in (0.32, 0.002)
-    )
-    assert "`x_o` is like them (p = 0.32)" in like
-    assert "This need not hold for `x_o`, which differs from the pairs" in unlike
-
-
 @pytest.mark.medium
-def test_a_batch_unlike_the_pairs_gives_a_warning() -> None:
+def test_a_batch_unlike_the_pairs_gives_a_warning_and_is_in_the_text() -> None:
     options = {"candidates": [NPE, PRIOR]}
     with pytest.warns(RoPEWarning, match="differs from the observations of the cal"):
-        report = stacked(rope_of(), observed() + 1.0, **options).report
-    assert report.batch is not None
-    assert report.batch.is_different
+        unlike = stacked(rope_of(), observed() + 1.0, **options).report
+    assert "This need not hold for `x_o`, which differs from the pairs" in flat(unlike)
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message="`x_o` differs")
         like = stacked(rope_of(), observed(), **options).report
-    assert like.batch is not None
-    assert not like.batch.is_different
-    assert the_stack().report.batch is None
+    assert "`x_o` is like them (p = " in flat(like)
+    assert "`diagnose(rope, x_o, posterior=posterior)` tests others" in flat(made_up())
 
 
 def test_a_stack_with_a_discrepancy_says_what_the_pairs_say_about_each_entry() -> None:
@@ -250,8 +220,6 @@ def test_a_report_names_pairs_whose_parameters_do_not_follow_the_prior() -> None
     theta = 0.2 * problem(20, seed=1)[0]
     middle = rope_of((theta, problems.simulate(theta) + 0.4))
     found = stacked(middle, candidates=[PRIOR, NPE, DISCREPANCY]).report
-    assert found.probability_of_prior is not None
-    assert found.probability_of_prior < 1e-3
     text = flat(found)
     assert "labels are not distributed like the prior" in text
     assert "The stack expects the same of new observations" in text
@@ -259,11 +227,7 @@ def test_a_report_names_pairs_whose_parameters_do_not_follow_the_prior() -> None
     kept = flat(stacked(middle, candidates=[PRIOR, NPE]).report)
     assert "Scores and coverage hold for parameters like these" in kept
     assert "learn_prior=False" not in kept
-    # These pairs follow the prior.
-    usual = the_stack().report
-    assert usual.probability_of_prior is not None
-    assert usual.probability_of_prior > 0.5
-    assert "not distributed like the prior" not in flat(usual)
+    assert "not distributed like the prior" not in flat(the_stack().report)
 
 
 # Groups -------------------------------------------------------------------------------
@@ -427,7 +391,6 @@ def test_the_provenance_names_default_candidates_that_the_data_do_not_allow() ->
     chosen = stacked(rope_of(), candidates=[PRIOR]).report.provenance
     assert chosen["left out"] == "none"
     assert chosen["seed"] == "0"
-    assert f"torch {torch.__version__}" in chosen["versions"]
 
 
 @pytest.mark.medium
@@ -441,9 +404,8 @@ def test_names_of_parameters_are_given_once(tmp_path: Path) -> None:
     assert load(tmp_path / "stack.pt").report.held_out.names == ("slope", "size")
     found = diagnose(named, x, num_simulations=100, num_folds=None, **QUIET)
     assert found.parameter_names == ("slope", "size")
-    for names in (("slope",), ("a", "a"), ("a", "b", "c")):
-        with pytest.raises(InvalidInputError, match="2 different names"):
-            rope_of(parameter_names=names)
+    with pytest.raises(InvalidInputError, match="2 different names"):
+        rope_of(parameter_names=("a", "a"))
 
 
 # The page -----------------------------------------------------------------------------
@@ -557,6 +519,4 @@ def test_names_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         write_html(report, path, parameter_names=("a",))
     with pytest.raises(InvalidInputError, match="Expected `x_names`"):
         write_html(report, path, x_names=("a", "b"))
-    with pytest.raises(InvalidInputError, match="Expected no `x_names`"):
-        write_html(replace(report, discrepancy=None), path, x_names=("a", "b", "c"))
     assert not path.exists()
