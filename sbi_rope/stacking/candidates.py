@@ -137,11 +137,10 @@ def as_density(own: Any, data: StackData, name: str) -> Density:
 
 # NPE of corrected simulations ---------------------------------------------------------
 
-NAMES: dict[Space, str] = {
-    "embedding": "discrepancy",
-    "input": "discrepancy (input)",
-    "tuned": "discrepancy (tuned)",
-}
+
+def name_of(space: Space) -> str:
+    """Return what a correction is called."""
+    return "discrepancy" if space == "embedding" else f"discrepancy ({space})"
 
 
 class CorrectingCandidate(Candidate):
@@ -177,7 +176,7 @@ class DiscrepancyCandidate(CorrectingCandidate):
         check("space", space, Space)
         check("learn_prior", learn_prior, bool)
         self.space, self.learns_prior = space, learn_prior
-        self.name = NAMES[space] + ("" if learn_prior else ", given prior")
+        self.name = name_of(space) + ("" if learn_prior else ", given prior")
 
     def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
         """Train NPE on corrected simulations."""
@@ -312,7 +311,7 @@ class FinetunedCandidate(CorrectingCandidate):
         self.name = self.family = "fine-tuned NPE"
         if space is not None:
             self.family = "discrepancy, fine-tuned"
-            self.name = f"{NAMES[space]}, fine-tuned"
+            self.name = f"{name_of(space)}, fine-tuned"
         self.name += ", rehearsed" if rehearse else ""
 
     def suits(self, data: StackData) -> bool:
@@ -331,11 +330,7 @@ class FinetunedCandidate(CorrectingCandidate):
         starts: list[Density] = [flow[numbers] for numbers in members]
         jobs, of_version = [], []
         for version, rows in enumerate(versions):
-            own_nodes = data.nodes(rows, [starts[version]], NUM_NODES)
-            # Rows that a version may not see have the nodes of its first.
-            place = torch.zeros_like(data.every)
-            place[rows] = torch.arange(len(rows), device=rows.device)
-            nodes = own_nodes[place]
+            nodes = data.nodes(rows, [starts[version]], NUM_NODES)[data.place(rows)]
             own = [*zip(members[version], data.holdouts(rows), strict=False)]
             if self.rehearse and own:
                 own = [own[version % len(own)]]
@@ -368,7 +363,7 @@ class FinetunedCandidate(CorrectingCandidate):
 MIN_OBSERVATIONS, MAX_OBSERVATIONS, MAX_ENTRIES = 30, 200, 10
 
 
-class UnlabelledCandidate(CorrectingCandidate):
+class UnlabelledCandidate(Candidate):
     """NPE trained on corrected simulations, as learned from unlabelled x, too.
 
     It assumes that the parameters of the observations follow the prior, see
@@ -382,7 +377,6 @@ class UnlabelledCandidate(CorrectingCandidate):
 
     name = "discrepancy, with x_o"
     learns_prior = False
-    space = "input"
 
     def __init__(self, x_o: Tensor) -> None:
         self.x_o = as_numbers("x_o", x_o).clone()

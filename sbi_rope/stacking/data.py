@@ -101,6 +101,12 @@ class StackData:
             return []
         return [(rows[~torch.isin(rows, part)], part) for part in parts]
 
+    def place(self, rows: Tensor) -> Tensor:
+        """Return the place of each pair among some rows, 0 for others, ``(n,)``."""
+        place = torch.zeros_like(self.every)
+        place[rows] = torch.arange(len(rows), device=rows.device)
+        return place
+
     def seed_of(self, rows: Tensor) -> int:
         """Return the seed of what is drawn for some rows."""
         key = rows.sort().values.tolist()
@@ -131,10 +137,7 @@ class StackData:
             width = self.embedded.shape[1]
             both = slice(0, width), slice(width, None)
             found = found.columns(both[space == "input"])
-        order = torch.cat([self.folds[k] for k in used])
-        place = torch.empty_like(self.every)
-        place[order] = torch.arange(len(order), device=order.device)
-        return found[place[rows]]
+        return found[self.place(torch.cat([self.folds[k] for k in used]))[rows]]
 
     def _moments(self, fold: int, *, of_x: bool) -> Moments:
         """Return moments at a fold: of h(x) and x side by side if x is short."""

@@ -363,13 +363,7 @@ def test_densities_that_are_given_are_stacked_as_they_are() -> None:
     assert float(drawn.std()) == pytest.approx(2.0, rel=0.1)
 
 
-def test_default_candidates_have_different_names_and_can_keep_the_prior() -> None:
-    assert [candidate.name for candidate in default_candidates()] == [
-        *("prior", "NPE", "fine-tuned NPE", "discrepancy", "discrepancy (input)"),
-        *("discrepancy (tuned)", "discrepancy, fine-tuned"),
-        *("discrepancy (input), fine-tuned", "discrepancy (tuned), fine-tuned"),
-        *("fine-tuned NPE, rehearsed", "regression", "regression (embedding)"),
-    ]
+def test_default_candidates_can_keep_the_prior() -> None:
     kept = default_candidates(learn_prior=False)
     assert [candidate.name for candidate in kept] == [
         *("prior", "NPE", "discrepancy, given prior"),
