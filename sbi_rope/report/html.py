@@ -78,6 +78,8 @@ def write_html(
     names = report.held_out.names
     if parameter_names is not None:
         names = names_of(parameter_names, len(names))
+        held_out = replace(report.held_out, parameter_names=names)
+        report = replace(report, held_out=held_out)
     if x_names is not None:
         if report.discrepancy is None:
             raise InvalidInputError(
@@ -109,7 +111,7 @@ def write_html(
 
 def _parts(report: StackingReport, names: Sequence[str]) -> Iterable[_Part]:
     """Yield the sections of the printed report, with their tables and pictures."""
-    helped, trust, simulator, more = (_Part(*one) for one in sections_of(report, names))
+    helped, trust, simulator, more = (_Part(*one) for one in sections_of(report))
     helped.heads = "candidate", "method", "weight", "nats a pair", "in prior units"
     helped.rows = [
         (

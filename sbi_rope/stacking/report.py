@@ -2,7 +2,7 @@
 
 import math
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -221,18 +221,11 @@ def headline(report: StackingReport) -> str:
     )
 
 
-def sections_of(
-    report: StackingReport, names: Sequence[str] | None = None
-) -> list[tuple[str, list[Line]]]:
-    """Return the questions of a reader, and the sentences that answer each.
-
-    Args:
-        report: The report.
-        names: A name for each parameter; those of the report if None.
-    """
+def sections_of(report: StackingReport) -> list[tuple[str, list[Line]]]:
+    """Return the questions of a reader, and the sentences that answer each."""
     return [
         ("Did it help?", [*_help(report)]),
-        ("May the intervals be trusted?", [*_trust(report, names)]),
+        ("May the intervals be trusted?", [*_trust(report)]),
         ("What is wrong with the simulator?", [*_simulator(report)]),
         ("Would more labels help?", [*_more_labels(report)]),
     ]
@@ -291,13 +284,13 @@ def _weights(report: StackingReport) -> Line:
     return text, family == "prior"
 
 
-def _trust(report: StackingReport, names: Sequence[str] | None) -> Iterator[Line]:
+def _trust(report: StackingReport) -> Iterator[Line]:
     held_out = report.held_out
     if held_out.ranks.isnan().all():
         yield "Coverage is not known for labels that are given as draws.", False
         return
     known = "parameters" if report.are_exact else "labels"
-    yield from held_out.lines(known=known, names=names)
+    yield from held_out.lines(known=known)
     if (
         verdict_of(held_out.acauc) == "over-confident"
         and held_out.num_independent >= FEWEST
