@@ -164,5 +164,9 @@ def small_stack() -> StackedPosterior:
         return stacked(rope_of(), candidates=[PRIOR, NPE, BOX], num_folds=5)
 
 
+def scores_of(report: StackingReport, name: str) -> Tensor:
+    return report.log_scores[:, report.names.index(name)]
+
+
 def unnormalised(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
     return posterior.log_prob_batched(theta, x, norm_posterior=False).detach()

@@ -17,7 +17,6 @@ from sbi_rope.plots._figures import (
     hide_frame,
 )
 from sbi_rope.stacking import LearningCurve, StackingReport
-from sbi_rope.stacking.sections import is_corrected
 from sbi_rope.utils.settings import check
 
 if TYPE_CHECKING:
@@ -102,9 +101,9 @@ def _draw_scores(
         beside: dict[str, Any] = {"xytext": (8, 0), "textcoords": "offset points"}
         axes.annotate(text, (edge, position), va="center", fontsize=SMALL, **beside)
     stacks = {"stack": report.held_out.lpp}
-    if is_corrected(report):
+    uncorrected = report.held_out.mean(report.comparable_scores)
+    if f"{uncorrected.mean:.2f}" != f"{report.held_out.lpp.mean:.2f}":
         # It is below the other, beside the candidates that it is compared with.
-        uncorrected = report.held_out.mean(report.comparable_scores)
         stacks = {"stack, uncorrected": uncorrected, **stacks}
     for position, (name, one) in enumerate(stacks.items(), start=len(found)):
         face = BLUE if name == "stack" else "white"

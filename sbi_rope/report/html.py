@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from sbi_rope.diagnosis import Diagnosis
 from sbi_rope.plots import discrepancy, implied_parameters, stacking_report
 from sbi_rope.stacking import StackingReport
-from sbi_rope.stacking.sections import METHODS, headline, sections_of
+from sbi_rope.stacking.report import METHODS, headline, sections_of
 from sbi_rope.utils.settings import check, names_of
 
 if TYPE_CHECKING:
@@ -92,9 +92,7 @@ def write_html(
 
 def _parts(report: StackingReport) -> Iterator[_Part]:
     """Yield the sections of the printed report, with their tables and pictures."""
-    helped, trust, simulator, more = (
-        _Part(one.title, one.lines) for one in sections_of(report)
-    )
+    helped, trust, simulator, more = (_Part(*one) for one in sections_of(report))
     helped.heads = "candidate", "method", "weight", "nats a pair", "in prior units"
     helped.rows = [
         (

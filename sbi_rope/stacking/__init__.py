@@ -14,7 +14,7 @@ from sbi_rope.stacking.data import StackData
 from sbi_rope.stacking.posterior import StackedPosterior
 from sbi_rope.stacking.report import LearningCurve, StackingReport
 from sbi_rope.stacking.stack import stack
-from sbi_rope.stacking.weights import StackingWeights, stacking_weights
+from sbi_rope.stacking.weights import stacking_weights
 
 __all__ = [
     "Candidate",
@@ -27,7 +27,6 @@ __all__ = [
     "StackData",
     "StackedPosterior",
     "StackingReport",
-    "StackingWeights",
     "UnlabelledCandidate",
     "default_candidates",
     "stack",

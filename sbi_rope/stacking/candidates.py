@@ -6,8 +6,8 @@ type.
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ from torch import Tensor
 from sbi_rope.data.pairs import without_warning_of_few_pairs
 from sbi_rope.density import Density, Flow, GaussianProcess, Given, Prior, density_of
 from sbi_rope.discrepancy.correction import (
-    Correction,
+    MOST_ENTRIES,
     SimulatedConstants,
     Space,
     Version,
@@ -31,11 +31,7 @@ from sbi_rope.rope.finetuning import FINETUNING, TUNING, finetune_flow
 from sbi_rope.rope.rope import RoPE
 from sbi_rope.stacking.data import NUM_FOLDS, StackData, key_of
 from sbi_rope.training.ensemble import Ensemble
-from sbi_rope.utils.errors import (
-    InvalidInputError,
-    UnsupportedPosteriorError,
-    warn_user,
-)
+from sbi_rope.utils.errors import UnsupportedPosteriorError
 from sbi_rope.utils.settings import check
 from sbi_rope.utils.tensors import as_batch, as_numbers
 
@@ -49,21 +45,15 @@ class Candidate(ABC):
             that of the candidate if it has none.
         learns_prior: Whether it learns from the pairs how parameters are distributed,
             as all training on them does.
-        needs: What the data need for it, for the report of a stack that leaves it out.
     """
 
     name: str
     family: str = ""
     learns_prior: bool = True
-    needs: str = ""
 
     def suits(self, data: StackData) -> bool:
         """Tell whether the data allow it. The default stack leaves it out if not."""
         return True
-
-    def check(self, data: StackData) -> None:
-        """Raise if it cannot be trained, before any candidate is."""
-        return
 
     @abstractmethod
     def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
@@ -118,29 +108,13 @@ class GivenCandidate(Candidate):
         self.density = density
         self.name = type(density).__name__ if name is None else name
 
-    def check(self, data: StackData) -> None:
-        """Try the density on two pairs."""
-        as_density(self.density, data, self.name)
-
     def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
         """Return the density for all versions."""
-        return [as_density(self.density, data, self.name)] * len(versions)
-
-
-def as_densities(found: Sequence[Any], data: StackData, name: str) -> list[Density]:
-    """Return what a candidate returned as densities; equal ones stay one object."""
-    different = {id(one): as_density(one, data, name) for one in found}
-    return [different[id(one)] for one in found]
+        return [self.density] * len(versions)
 
 
 def as_density(own: Any, data: StackData, name: str) -> Density:
-    """Return a posterior or anything else as a density, tried on two pairs.
-
-    Raises:
-        InvalidInputError: If the shapes of what it returns do not fit.
-        UnsupportedPosteriorError: If it has no density, belongs to a batch, or has
-            other shapes of theta or x.
-    """
+    """Return a posterior or anything else as a density, tried on two pairs."""
     theta, x = data.pairs.mean[:2], data.pairs.x[:2]
     if isinstance(own, NeuralPosterior):
         if not getattr(own, "is_amortised", True):
@@ -149,8 +123,6 @@ def as_density(own: Any, data: StackData, name: str) -> Density:
                 "that belongs to a batch."
             )
         own = density_of(own, what=f"the candidate {name!r}")
-    if isinstance(own, Prior):
-        return Prior(own.prior, x.shape[1:])  # that of no observation in particular
     if not isinstance(own, Density):
         return Given(own, theta, x)
     shapes = own.condition_shape, own.input_shape
@@ -163,17 +135,12 @@ def as_density(own: Any, data: StackData, name: str) -> Density:
     return own
 
 
-# What a correction is called, and what the data need for it, in words.
-NAMES: dict[Space, str] = {
-    "embedding": "discrepancy",
-    "input": "discrepancy (input)",
-    "tuned": "discrepancy (tuned)",
-}
-NEEDS: dict[Space, str] = {
-    "embedding": "",
-    "input": "short x without NaN, and an embedding net",
-    "tuned": "long x, 3 folds",
-}
+# NPE of corrected simulations ---------------------------------------------------------
+
+
+def name_of(space: Space) -> str:
+    """Return what a correction is called."""
+    return "discrepancy" if space == "embedding" else f"discrepancy ({space})"
 
 
 class CorrectingCandidate(Candidate):
@@ -182,19 +149,14 @@ class CorrectingCandidate(Candidate):
     space: Space | None
 
     def suits(self, data: StackData) -> bool:
-        """Tell whether x is a short vector, or else there are folds enough to tune."""
-        # A short vector is corrected as it is, so that tuned nets add nothing.
-        if self.space == "tuned":
-            return not data.reads_summaries and len(data.folds) > 2
-        return self.space != "input" or data.reads_summaries
-
-    def check(self, data: StackData) -> None:
-        """Raise if x is too long, or for ``space="input"`` no vector without NaN."""
-        if self.space is not None:
-            network_of(data.estimator, self.space)
+        """Tell whether what it corrects is short, and what only nets help is long."""
         if self.space == "input":
-            as_batch("x", data.pairs.x)
-            as_batch("x of simulations", data.simulations[1])
+            return data.reads_summaries
+        # A short vector is corrected as it is, so that tuned nets add nothing.
+        if self.space == "tuned" and (data.reads_summaries or len(data.folds) < 3):
+            return False
+        is_short = data.pairs.x[0].numel() <= MOST_ENTRIES
+        return self.space is None or is_short or has_parameters(data.embedding_net)
 
 
 class DiscrepancyCandidate(CorrectingCandidate):
@@ -213,8 +175,8 @@ class DiscrepancyCandidate(CorrectingCandidate):
     def __init__(self, *, space: Space = "embedding", learn_prior: bool = True) -> None:
         check("space", space, Space)
         check("learn_prior", learn_prior, bool)
-        self.space, self.learns_prior, self.needs = space, learn_prior, NEEDS[space]
-        self.name = NAMES[space] + ("" if learn_prior else ", given prior")
+        self.space, self.learns_prior = space, learn_prior
+        self.name = name_of(space) + ("" if learn_prior else ", given prior")
 
     def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
         """Train NPE on corrected simulations."""
@@ -226,87 +188,7 @@ class DiscrepancyCandidate(CorrectingCandidate):
         return [flow[numbers[:several]] for numbers in members]
 
 
-def corrected(
-    data: StackData, versions: Sequence[Tensor], space: Space, *, learn_prior: bool
-) -> Correction:
-    """Return NPE trained on corrected simulations, a copy for each version."""
-    key = space, learn_prior, key_of(versions)
-    if key not in data.kept:
-        z_s = data.simulations[1] if space == "input" else data.embedded
-        simulations = data.simulations[0], z_s
-        if space == "tuned":
-            nets = tuned(data, versions)
-            z = [nets.held_out(rows, data) for rows in versions]
-        else:
-            net = network_of(data.estimator, space)
-            z = [embed(net, data.pairs.x[rows]) for rows in versions]
-        fitted: list[Version] = [
-            fit_version(
-                data.pairs[rows],
-                of_rows,
-                data.moments(rows, space),
-                simulations,
-                data.model,
-                learn_prior=learn_prior,
-            )
-            for of_rows, rows in zip(z, versions, strict=True)
-        ]
-        data.kept[key] = correct_flow(
-            data.estimator,
-            simulations,
-            fitted,
-            space=space,
-            in_a_stack=True,
-            show_progress_bars=data.show,
-        )
-    return data.kept[key]
-
-
-@dataclass(frozen=True, eq=False)
-class Tuned:
-    """Embedding nets that are tuned on sets of pairs."""
-
-    nets: Ensemble
-    number: dict[Any, int]  # of the net that was tuned on a set of rows
-
-    def of(self, rows: Tensor, data: StackData) -> list[int]:
-        """Return the numbers of the nets that do not see each part of some rows."""
-        return [self.number[key_of([seen])] for seen, _ in _seen(rows, data)]
-
-    def held_out(self, rows: Tensor, data: StackData) -> Tensor:
-        """Return the embeddings of pairs by nets that have not seen them."""
-        z = data.embedded.new_empty(len(data), data.embedded.shape[1])
-        parts = [part for _, part in _seen(rows, data)]
-        for number, part in zip(self.of(rows, data), parts, strict=True):
-            z[part] = embed(self.nets.member(number), data.pairs.x[part])
-        return z[rows]
-
-
-def _seen(rows: Tensor, data: StackData) -> list[tuple[Tensor, Tensor]]:
-    """Return what is seen and what is not; one person alone is both."""
-    return data.holdouts(rows) or [(rows, rows)]
-
-
-def tuned(data: StackData, versions: Sequence[Tensor]) -> Tuned:
-    """Return nets tuned on each version without each of its parts, with rehearsal."""
-    key = "tuned", key_of(versions)
-    if key not in data.kept:
-        sets = {
-            key_of([seen]): seen for rows in versions for seen, _ in _seen(rows, data)
-        }
-        with without_warning_of_few_pairs():
-            nets, _ = TUNING.tuned(
-                data.embedding_net,
-                data.pairs.x,
-                [data.targets(rows) for rows in sets.values()],
-                list(sets.values()),
-                groups=data.pairs.group,
-                weights=data.pairs.weight,
-                draw_simulations=lambda count: data.simulations[1][:count],
-                show_progress_bars=data.show,
-            )
-        data.kept[key] = Tuned(nets, {rows: number for number, rows in enumerate(sets)})
-    return data.kept[key]
+Parts = Sequence[tuple[Tensor, Tensor]]
 
 
 def started(
@@ -317,30 +199,91 @@ def started(
     learn_prior: bool = True,
 ) -> tuple[Flow, list[list[int]]]:
     """Return NPE, corrected or not, for each part of each version; their numbers."""
-    numbers: list[list[int]] = []
-    of_version: list[int] = []
-    for version, rows in enumerate(versions):
-        first, count = len(of_version), len(_seen(rows, data))
-        numbers.append([*range(first, first + count)])
-        of_version += [version] * count
+    # A single person is both seen and held out.
+    parts = [data.holdouts(rows) or [(rows, rows)] for rows in versions]
+    of_version = [v for v, some in enumerate(parts) for _ in some]
+    each = torch.arange(len(of_version)).split([*map(len, parts)])
+    numbers = [some.tolist() for some in each]
     if space is None:
         flow = Flow.of([data.estimator])
         return flow.made_of([(0, 0)] * len(of_version)), numbers
-    found = corrected(data, versions, space, learn_prior=learn_prior)
-    if space == "embedding":
-        return found.flow[of_version], numbers
-    of_nets, nets = [min(v, len(found.flow.nets) - 1) for v in of_version], None
+    if (key := (space, learn_prior, key_of(versions))) in data.kept:
+        return data.kept[key], numbers
+    nets, of_nets = None, []
     if space == "tuned":
-        of_parts = tuned(data, versions)
-        of_nets = [number for rows in versions for number in of_parts.of(rows, data)]
-        nets = of_parts.nets.then(found.constants)
-    members = list(zip(of_nets, of_version, strict=True))
-    return found.flow.made_of(members, nets), numbers
+        nets, of_nets, z = tuned(data, parts)
+        z = [of_pairs[rows] for of_pairs, rows in zip(z, versions, strict=True)]
+    else:
+        net = network_of(data.estimator, space)
+        # What the net reads may hold NaN.
+        z = [as_batch("x", embed(net, data.pairs.x[rows])) for rows in versions]
+    z_s = data.simulations[1] if space == "input" else data.embedded
+    simulations = data.simulations[0], as_batch("x of simulations", z_s)
+    fitted: list[Version] = [
+        fit_version(
+            data.pairs[rows],
+            of_rows,
+            data.moments(rows, space),
+            simulations,
+            data.model,
+            learn_prior=learn_prior,
+        )
+        for of_rows, rows in zip(z, versions, strict=True)
+    ]
+    found = correct_flow(
+        data.estimator,
+        simulations,
+        fitted,
+        space=space,
+        in_a_stack=True,
+        show_progress_bars=data.show,
+    )
+    if space == "embedding":
+        flow = found.flow[of_version]
+    else:
+        nets = nets.then(found.constants) if nets else None
+        of_nets = of_nets or [min(v, len(found.flow.nets) - 1) for v in of_version]
+        flow = found.flow.made_of([*zip(of_nets, of_version, strict=True)], nets)
+    data.kept[key] = flow
+    return flow, numbers
+
+
+def tuned(
+    data: StackData, versions: Sequence[Parts]
+) -> tuple[Ensemble, list[int], list[Tensor]]:
+    """Tune nets, with rehearsal, on what is seen when each part is held out.
+
+    There are also the number of the net of each part and, for each version, embeddings
+    of all pairs by nets that have not seen them.
+    """
+    sets = {key_of([seen]): seen for parts in versions for seen, _ in parts}
+    with without_warning_of_few_pairs():
+        nets, _ = TUNING.tuned(
+            data.embedding_net,
+            data.pairs.x,
+            [data.targets(rows) for rows in sets.values()],
+            list(sets.values()),
+            groups=data.pairs.group,
+            weights=data.pairs.weight,
+            draw_simulations=lambda count: data.simulations[1][:count],
+            show_progress_bars=data.show,
+        )
+    place = {key: number for number, key in enumerate(sets)}
+    numbers, held_out = [], []
+    for parts in versions:
+        z = data.embedded.new_empty(len(data), data.embedded.shape[1])
+        for seen, part in parts:
+            numbers.append(place[key_of([seen])])
+            z[part] = embed(nets.member(numbers[-1]), data.pairs.x[part])
+        held_out.append(z)
+    return nets, numbers, held_out
 
 
 # How NPE is fine-tuned. Behind a corrected x all parameters were trained already, and a
 # smaller rate is enough. Chosen on calibration data, see benchmarks/choices.md.
 LEARNING_RATE, LEARNING_RATE_OF_INPUT = 1e-3, 3e-4
+# Nodes at which the density of a label is computed that is not exact.
+NUM_NODES = 64
 # With rehearsal, and pairs with different parameters that it needs: on calibration data
 # it was worse than fine-tuned NPE with 50, and better with 200.
 REHEARSED, MIN_TO_REHEARSE = replace(FINETUNING, stop_after_epochs=10), 100
@@ -366,11 +309,9 @@ class FinetunedCandidate(CorrectingCandidate):
         check("rehearse", rehearse, bool)
         self.space, self.rehearse = space, rehearse
         self.name = self.family = "fine-tuned NPE"
-        self.needs = f"{MIN_TO_REHEARSE} pairs, long x" if rehearse else "3 folds"
         if space is not None:
             self.family = "discrepancy, fine-tuned"
-            self.name = f"{NAMES[space]}, fine-tuned"
-            self.needs = NEEDS[space] or "long x"
+            self.name = f"{name_of(space)}, fine-tuned"
         self.name += ", rehearsed" if rehearse else ""
 
     def suits(self, data: StackData) -> bool:
@@ -389,8 +330,8 @@ class FinetunedCandidate(CorrectingCandidate):
         starts: list[Density] = [flow[numbers] for numbers in members]
         jobs, of_version = [], []
         for version, rows in enumerate(versions):
-            nodes = data.nodes(rows, starts[version])
-            own = list(zip(members[version], data.holdouts(rows), strict=False))
+            nodes = data.nodes(rows, [starts[version]], NUM_NODES)[data.place(rows)]
+            own = [*zip(members[version], data.holdouts(rows), strict=False)]
             if self.rehearse and own:
                 own = [own[version % len(own)]]
             of_version.append([*range(len(jobs), len(jobs) + len(own))])
@@ -417,6 +358,69 @@ class FinetunedCandidate(CorrectingCandidate):
         return [flow[own] if own else start for own, start in trained]
 
 
+# Observations without labels that the candidate needs, and those that it takes: more
+# add nothing. With more entries of x, its search takes long.
+MIN_OBSERVATIONS, MAX_OBSERVATIONS, MAX_ENTRIES = 30, 200, 10
+
+
+class UnlabelledCandidate(Candidate):
+    """NPE trained on corrected simulations, as learned from unlabelled x, too.
+
+    It assumes that the parameters of the observations follow the prior, see
+    ``sbi_rope.discrepancy.unlabelled``. The labels decide about its weight.
+
+    Args:
+        x_o: Real observations, shape ``(n_o, l)``, of which up to 200 are used. Those
+            of the calibration pairs should not be among them, so that the scores are
+            those of new observations. The stack may be asked about others, too.
+    """
+
+    name = "discrepancy, with x_o"
+    learns_prior = False
+
+    def __init__(self, x_o: Tensor) -> None:
+        self.x_o = as_numbers("x_o", x_o).clone()
+
+    def suits(self, data: StackData) -> bool:
+        """Tell whether there are enough observations, of few entries."""
+        return (
+            len(self.x_o) >= MIN_OBSERVATIONS
+            and data.pairs.are_exact
+            and data.compares_entries
+            and data.pairs.x.shape[1] <= MAX_ENTRIES
+            and bool(torch.isfinite(self.x_o).all())
+        )
+
+    def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
+        """Train NPE on corrected simulations."""
+        x_o = as_batch("x_o", data.rope.checked_observations(self.x_o))
+        x_s = data.simulations[1]
+        unit = Standardisation(x_s.double())
+        chosen = torch.randperm(len(x_o))[:MAX_OBSERVATIONS]
+        rows = torch.cat(list(versions)).unique()
+        weight = data.pairs.shared_weight[rows]
+        is_seen = torch.stack([torch.isin(rows, seen) for seen in versions])
+        found = fit_unlabelled(
+            unit(data.pairs.x[rows].double()),
+            in_units(data.moments(rows, "input"), unit),
+            weight.where(is_seen, 0.0).double(),
+            unit(x_o[chosen].to(x_s).double()),
+            Marginal.of(unit(x_s.double())),
+            show_progress_bars=data.show,
+        )
+        flow = correct_flow(
+            data.estimator,
+            data.simulations,
+            [(one, None) for one in found],
+            space="input",
+            in_a_stack=True,
+            show_progress_bars=data.show,
+        ).flow
+        return [flow[[version]] for version in range(len(versions))]
+
+
+# Without the simulator ----------------------------------------------------------------
+
 # With fewer pairs the candidate is left out.
 MIN_TO_REGRESS = 10
 
@@ -427,21 +431,17 @@ class RegressionCandidate(Candidate):
     See :class:`~sbi_rope.density.GaussianProcess`.
 
     Args:
-        space: What it depends on: x itself, with ``"input"``, or the embedding h(x).
+        embeds: Whether it depends on the embedding h(x), or on x itself.
     """
 
-    name = family = "regression"
-    needs = f"{MIN_TO_REGRESS} exact labels of continuous parameters, x without NaN"
+    family = "regression"
 
-    def __init__(self, *, space: Literal["embedding", "input"] = "input") -> None:
-        check("space", space, Literal["embedding", "input"])
-        self.embeds = space == "embedding"
-        if self.embeds:
-            self.name += " (embedding)"
-            self.needs += ", an embedding net"
+    def __init__(self, *, embeds: bool = False) -> None:
+        self.embeds = embeds
+        self.name = "regression (embedding)" if embeds else "regression"
 
     def suits(self, data: StackData) -> bool:
-        """Tell whether the data are as it needs them."""
+        """Tell whether labels are exact and continuous, and x has no missing entry."""
         theta, pairs = data.pairs.mean, data.pairs
         return (
             (has_parameters(data.embedding_net) or not self.embeds)
@@ -472,74 +472,7 @@ class RegressionCandidate(Candidate):
         ]
 
 
-# Observations without labels that the candidate needs, and those that it takes: more
-# add nothing. With more entries of x, its search takes long.
-MIN_OBSERVATIONS, MAX_OBSERVATIONS, MAX_ENTRIES = 30, 200, 10
-
-
-class UnlabelledCandidate(CorrectingCandidate):
-    """NPE trained on corrected simulations, as learned from unlabelled x, too.
-
-    It assumes that the parameters of the observations follow the prior, see
-    ``sbi_rope.discrepancy.unlabelled``. The labels decide about its weight.
-
-    Args:
-        x_o: Real observations, shape ``(n_o, l)``, of which up to 200 are used. Those
-            of the calibration pairs should not be among them, so that the scores are
-            those of new observations. The stack may be asked about others, too.
-
-    Raises:
-        InvalidInputError: If x_o holds no numbers. Its shape is checked in the stack.
-    """
-
-    name = "discrepancy, with x_o"
-    learns_prior = False
-    needs = f"{MIN_OBSERVATIONS} observations of {MAX_ENTRIES} numbers, exact labels"
-    space = "input"
-
-    def __init__(self, x_o: Tensor) -> None:
-        self.x_o = as_numbers("x_o", x_o).clone()
-
-    def suits(self, data: StackData) -> bool:
-        """Tell whether there are enough observations, of few entries."""
-        return (
-            len(self.x_o) >= MIN_OBSERVATIONS
-            and data.pairs.are_exact
-            and data.compares_entries
-            and data.pairs.x.shape[1] <= MAX_ENTRIES
-            and bool(torch.isfinite(self.x_o).all())
-        )
-
-    def check(self, data: StackData) -> None:
-        """Raise for observations of another shape, and those that are not finite."""
-        as_batch("x_o", data.rope.checked_observations(self.x_o))
-        super().check(data)
-
-    def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
-        """Train NPE on corrected simulations."""
-        x_s = data.simulations[1]
-        unit = Standardisation(x_s.double())
-        chosen = torch.randperm(len(self.x_o))[:MAX_OBSERVATIONS]
-        rows = torch.cat(list(versions)).unique()
-        weight = data.pairs.shared_weight[rows]
-        is_seen = torch.stack([torch.isin(rows, seen) for seen in versions])
-        found = fit_unlabelled(
-            unit(data.pairs.x[rows].double()),
-            in_units(data.moments(rows, "input"), unit),
-            weight.where(is_seen, 0.0).double(),
-            unit(self.x_o[chosen].to(x_s).double()),
-            Marginal.of(unit(x_s.double())),
-            show_progress_bars=data.show,
-        )
-        flow = correct_flow(
-            data.estimator,
-            data.simulations,
-            [(one, None) for one in found],
-            space="input",
-            in_a_stack=True,
-            show_progress_bars=data.show,
-        ).flow
-        return [flow[[version]] for version in range(len(versions))]
+# Those of a default stack -------------------------------------------------------------
 
 
 def default_candidates(
@@ -551,54 +484,19 @@ def default_candidates(
         rope: A RoPE with its calibration pairs. Candidates that these data do not
             allow or need are left out, as in :func:`stack`. None returns all.
         x_o: Real observations without labels, shape ``(n_o, *event)``, other than those
-            of the pairs. They add a discrepancy that is learned from them, too, unless
-            they are fewer than 30 or no vectors of at most ten entries, or labels are
-            not exact.
+            of the pairs. They add a discrepancy that is learned from them, too, if they
+            are 30 vectors or more of at most ten entries, and labels are exact.
         learn_prior: Whether candidates may learn from the pairs how parameters are
             distributed. They should if the pairs are drawn like the observations to be
             inferred. With False, discrepancy models keep the prior of NPE, and others
             that are trained on pairs are left out.
 
     Raises:
-        InvalidInputError: If an argument has the wrong type, or, with a rope, x_o has
-            the wrong shape or device, is empty or not finite.
+        InvalidInputError: If x_o has the wrong shape, or is not finite.
         NotReadyError: If ``rope`` has fewer than two calibration pairs.
     """
+    check("rope", rope, RoPE | None)
     check("learn_prior", learn_prior, bool)
-    if rope is None:
-        return _all_candidates(x_o, learn_prior=learn_prior)
-    check("rope", rope, RoPE)
-    x_o = None if x_o is None else rope.checked_observations(x_o)
-    data = StackData(rope, num_folds=NUM_FOLDS, seed=0, show_progress_bars=False)
-    return _suitable_candidates(data, x_o, learn_prior=learn_prior)
-
-
-def _suitable_candidates(
-    data: StackData, x_o: Tensor | None, *, learn_prior: bool = True
-) -> tuple[Candidate, ...]:
-    """Return the default candidates that the data allow; warn if x_o adds none."""
-    known = _all_candidates(x_o, learn_prior=learn_prior)
-    chosen = tuple(candidate for candidate in known if candidate.suits(data))
-    if x_o is not None and known[-1] not in chosen:
-        warn_user(
-            f"`x_o` adds no candidate, which takes {MIN_OBSERVATIONS} observations of "
-            f"at most {MAX_ENTRIES} numbers, and exact labels; got {len(x_o)} of shape "
-            f"{tuple(x_o.shape[1:])}. It is compared with the pairs."
-        )
-    return chosen
-
-
-def left_out(candidates: Sequence[Candidate], x_o: Tensor | None) -> str:
-    """Return which default candidates are not among some, and what they need."""
-    names = {candidate.name for candidate in candidates}
-    return "; ".join(
-        f"{one.name} (needs {one.needs})"
-        for one in _all_candidates(x_o, learn_prior=True)
-        if one.name not in names
-    )
-
-
-def _all_candidates(x_o: Tensor | None, *, learn_prior: bool) -> tuple[Candidate, ...]:
     spaces: tuple[Space, ...] = ("embedding", "input", "tuned")
     candidates: list[Candidate] = [
         PriorCandidate(),
@@ -608,34 +506,13 @@ def _all_candidates(x_o: Tensor | None, *, learn_prior: bool) -> tuple[Candidate
         *(FinetunedCandidate(space=one) for one in spaces),
         FinetunedCandidate(rehearse=True),
         RegressionCandidate(),
-        RegressionCandidate(space="embedding"),
-        *([] if x_o is None else [UnlabelledCandidate(x_o)]),
+        RegressionCandidate(embeds=True),
     ]
-    return tuple(one for one in candidates if learn_prior or not one.learns_prior)
-
-
-def chosen_candidates(
-    candidates: Sequence[Any] | None, data: StackData, x_o: Tensor | None
-) -> tuple[Candidate, ...]:
-    """Return the candidates of a user, or those by default, all of which can be used.
-
-    Raises:
-        InvalidInputError: If there is none, two have the same name, or entries of x are
-            missing that one of them corrects.
-        UnsupportedPosteriorError: If one that is given cannot be used.
-    """
-    check("candidates", candidates, Sequence | None)
-    if candidates is None:
-        candidates = _suitable_candidates(data, x_o)
-    chosen = tuple(
-        one if isinstance(one, Candidate) else GivenCandidate(one) for one in candidates
-    )
-    names = [candidate.name for candidate in chosen]
-    if not names or len(set(names)) < len(names) or "stack" in names:
-        raise InvalidInputError(
-            "Expected `candidates` with different names, none of them 'stack'; got "
-            f"{names}. Name a density with `GivenCandidate(density, name)`."
-        )
-    for one in chosen:
-        one.check(data)
-    return chosen
+    if x_o is not None:
+        x_o = x_o if rope is None else rope.checked_observations(x_o)
+        candidates.append(UnlabelledCandidate(x_o))
+    candidates = [one for one in candidates if learn_prior or not one.learns_prior]
+    if rope is None:
+        return tuple(candidates)
+    data = StackData(rope, num_folds=NUM_FOLDS, seed=0, show_progress_bars=False)
+    return tuple(one for one in candidates if one.suits(data))

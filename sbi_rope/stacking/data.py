@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from sbi_rope.data.labels import nodes_of
 from sbi_rope.data.pairs import Nodes
@@ -27,9 +27,8 @@ from sbi_rope.utils.seeds import seeded
 NUM_SIMULATIONS, SIMULATIONS_PER_PAIR = 10_000, 100
 # A vector x with more entries is not treated as a list of summaries.
 MAX_SUMMARIES = 20
-# Samples of an estimator that is trained on labels that are not exact, and the nodes at
-# which their density is computed.
-NUM_SAMPLES, NUM_NODES = 200, 64
+# Samples of a density at each label that is not exact, from which nodes are placed.
+NUM_SAMPLES = 200
 # Folds of the calibration pairs, and parts of a single fold, a net without each of
 # which is trained.
 NUM_FOLDS, NUM_INNER_FOLDS = 5, 5
@@ -61,7 +60,7 @@ class StackData:
         self.rope, self.npe, self.show = rope, rope.npe, show_progress_bars
         self.estimator, self.source = estimator_of(self.npe), rope.source
         self.prior, self.pairs = PriorDistribution(self.npe.prior), rope.pairs
-        self.model = DiscrepancyModel()
+        self.model, self.embedding_net = DiscrepancyModel(), rope.embedding_net
         labels = len(self.pairs.label.unique())
         if (count := min(self.pairs.num_groups, labels)) < 2:
             raise NotReadyError(
@@ -70,6 +69,10 @@ class StackData:
             )
         of_folds, self.seed = draw_seeds(seed, 2)
         self.folds = self.pairs.folds(num_folds, seed=of_folds)
+        self.every = torch.cat(self.folds)
+        # Whether x is a vector of few entries, and neither a series nor an image.
+        x = self.pairs.x
+        self.is_short = x.ndim == 2 and x.shape[1] <= MAX_SUMMARIES
         self.kept: dict[Hashable, Any] = {}
 
     def __len__(self) -> int:
@@ -84,25 +87,25 @@ class StackData:
         used = sorted((fold + 1 + j) % count for j in range(num_folds))
         return torch.cat([self.folds[number] for number in used])
 
-    @property
-    def every(self) -> Tensor:
-        """The rows of all folds."""
-        return torch.cat(self.folds)
-
-    def parts(self, rows: Tensor) -> list[Tensor]:
-        """Cut rows into folds, of which one alone is divided further by groups."""
-        folds = [fold for fold in self.folds if torch.isin(fold, rows).all()]
-        if len(folds) > 1:
-            return folds
-        inner = self.pairs[rows].folds(NUM_INNER_FOLDS, seed=self.seed_of(rows))
-        return [rows[part] for part in inner]
-
     def holdouts(self, rows: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Return the rows to train on and those held out, for each part in turn."""
-        parts = self.parts(rows)
+        """Return the rows to train on and those held out, for each part in turn.
+
+        The parts are folds. A single fold is divided further by groups, and a single
+        group leaves nothing to hold out.
+        """
+        parts = [fold for fold in self.folds if torch.isin(fold, rows).all()]
+        if len(parts) < 2:
+            inner = self.pairs[rows].folds(NUM_INNER_FOLDS, seed=self.seed_of(rows))
+            parts = [rows[part] for part in inner]
         if len(parts) < 2:
             return []
         return [(rows[~torch.isin(rows, part)], part) for part in parts]
+
+    def place(self, rows: Tensor) -> Tensor:
+        """Return the place of each pair among some rows, 0 for others, ``(n,)``."""
+        place = torch.zeros_like(self.every)
+        place[rows] = torch.arange(len(rows), device=rows.device)
+        return place
 
     def seed_of(self, rows: Tensor) -> int:
         """Return the seed of what is drawn for some rows."""
@@ -111,11 +114,6 @@ class StackData:
         return int(sequence.generate_state(1)[0])
 
     # --- simulations ---
-
-    @cached_property
-    def embedding_net(self) -> nn.Module:
-        """The embedding net h of NPE."""
-        return self.rope.embedding_net
 
     @cached_property
     def simulations(self) -> tuple[Tensor, Tensor]:
@@ -130,56 +128,39 @@ class StackData:
     def moments(self, rows: Tensor, space: Space) -> Moments:
         """Return moments of simulations at some pairs: of x with "input", else h(x)."""
         used = [k for k, fold in enumerate(self.folds) if torch.isin(fold, rows).any()]
-        parts = [self._moments(number, space) for number in used]
+        parts = [self._moments(k, of_x=space == "input") for k in used]
         found = Moments(
             means=torch.cat([part.means for part in parts]),
             covariance=torch.cat([part.covariance for part in parts]),
         )
-        of_found = torch.cat([self.folds[number] for number in used])
-        place = torch.zeros(len(self), dtype=torch.long, device=rows.device)
-        place[of_found] = torch.arange(len(of_found), device=rows.device)
-        return found[place[rows]]
+        if self.is_short:
+            width = self.embedded.shape[1]
+            both = slice(0, width), slice(width, None)
+            found = found.columns(both[space == "input"])
+        return found[self.place(torch.cat([self.folds[k] for k in used]))[rows]]
 
-    def _moments(self, fold: int, space: Space) -> Moments:
+    def _moments(self, fold: int, *, of_x: bool) -> Moments:
+        """Return moments at a fold: of h(x) and x side by side if x is short."""
         h, rows = self.embedding_net, self.folds[fold]
-        of_x = space == "input"
 
         def represent(x: Tensor) -> Tensor:
-            # Side by side if x is short, so that both are of the same simulations.
-            parts = [embed(h, x)] * (self.is_short or not of_x)
-            return torch.cat(parts + [x] * (self.is_short or of_x), dim=1)
+            if self.is_short:  # so that both are of the same simulations
+                return torch.cat([embed(h, x), x], dim=1)
+            return x if of_x else embed(h, x)
 
-        key = "moments", fold, self.is_short or of_x
+        key = "moments", fold, of_x and not self.is_short
         if key not in self.kept:
+            what = self.source, self.pairs[rows], SIMULATIONS_PER_PAIR, represent
             with seeded(self.seed_of(rows)):
-                self.kept[key] = moments(
-                    self.source,
-                    self.pairs[rows],
-                    SIMULATIONS_PER_PAIR,
-                    represent,
-                    progress=self.show,
-                )
-        width = self.embedded.shape[1]
-        if of_x:
-            return self.kept[key].columns(slice(width if self.is_short else 0, None))
-        return self.kept[key].columns(slice(0, width))
-
-    # --- what x is like ---
-
-    @property
-    def is_short(self) -> bool:
-        """Whether x is a vector of few entries, and neither a series nor an image."""
-        return self.pairs.x.ndim == 2 and self.pairs.x.shape[1] <= MAX_SUMMARIES
+                self.kept[key] = moments(*what, progress=self.show)
+        return self.kept[key]
 
     @cached_property
     def compares_entries(self) -> bool:
         """Whether x is a short vector without missing entries, simulated or real."""
         # Missing entries (NaN) can be embedded, but not corrected.
-        return (
-            self.is_short
-            and bool(torch.isfinite(self.pairs.x).all())
-            and bool(torch.isfinite(self.simulations[1]).all())
-        )
+        every = self.pairs.x, self.simulations[1]
+        return self.is_short and all(bool(torch.isfinite(x).all()) for x in every)
 
     @property
     def reads_summaries(self) -> bool:
@@ -204,34 +185,23 @@ class StackData:
                 pairs.group,
                 seed=self.seed_of(rows),
             )
-        targets = found.new_zeros(len(self), found.shape[1])
-        targets[rows] = found
-        return targets
+        return found.new_zeros(len(self), found.shape[1]).index_copy(0, rows, found)
 
     @torch.no_grad()
-    def nodes(self, rows: Tensor, start: Density) -> Nodes:
-        """Return nodes to compute the density of labels at, of use for these rows only.
+    def nodes(self, rows: Tensor, near: Sequence[Density], num_nodes: int) -> Nodes:
+        """Return nodes to compute the density of labels at, near samples of densities.
 
-        The density that is trained may move away from its ``start``, so that the nodes
-        spread as far as the prior does.
+        They also spread as far as the prior does. Of exact labels there is one node.
         """
+        x, size = self.pairs.x[rows], torch.Size((NUM_SAMPLES,))
         if self.pairs.are_exact:
-            return Nodes.exact(self.pairs.mean)
+            return Nodes.exact(self.pairs.mean[rows])
         with seeded(self.seed_of(rows)):
-            samples = start.sample(torch.Size((NUM_SAMPLES,)), self.pairs.x[rows])
-            found = nodes_of(
-                self.pairs[rows], [samples], self.prior, num_nodes=NUM_NODES
-            )
-        theta = found.theta[:1].expand(len(self), -1, -1).clone()
-        log_weights = found.log_weights[:1].expand(len(self), -1).clone()
-        theta[rows], log_weights[rows] = found.theta, found.log_weights
-        return Nodes(theta=theta, log_weights=log_weights)
+            samples = [one.sample(size, x) for one in near]
+            return nodes_of(self.pairs[rows], samples, self.prior, num_nodes=num_nodes)
 
     def discrepancy(self) -> DiscrepancyReport:
-        """Return what all pairs say about each entry of x, which is a short vector.
-
-        It needs no simulations beyond those of the candidates.
-        """
+        """Return what all pairs say about each entry of x, which is a short vector."""
         return report_discrepancy(
             self.pairs.x,
             self.moments(self.every.sort().values, "input"),

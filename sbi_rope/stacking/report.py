@@ -1,24 +1,44 @@
-"""The report of a stack: what out-of-fold scores say about it."""
+"""The report of a stack: what out-of-fold scores say about it, in numbers and words."""
 
 import math
+import textwrap
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from sbi_rope.density.sets import SetScores
+from sbi_rope.data.parameters import is_improbable
+from sbi_rope.density.sets import SetScores, rank_needed
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.metrics import Evaluation
+from sbi_rope.metrics.evaluation import FEWEST, LEVEL, verdict_of
 from sbi_rope.metrics.statistics import Estimate, TwoSampleTest
-from sbi_rope.stacking.sections import sections_of, text_of
-from sbi_rope.stacking.weights import (
-    StackingWeights,
-    fold_weights,
-    stacking_weights,
-)
-from sbi_rope.utils.settings import Count, check, one_of
+from sbi_rope.utils.settings import Count, check
+
+# How many more labels the learning curve is read for; and twice as many as there are.
+FEW_MORE = 10
+# A difference of less than this, in nats a pair, is slight: 10 % of the density. With
+# one of so many, a network is far from anything that it has seen.
+SLIGHT, INCOMPARABLE = 0.1, 1e6
+# Smaller weights, and more entries of x, are not listed in the text.
+SMALL_WEIGHT, MAX_ENTRIES = 0.005, 5
+
+REFERENCES = {"prior": "the prior", "NPE": "NPE as it was"}
+METHODS = {
+    "prior": "the prior, which learns nothing from x",
+    "NPE": "NPE as it was trained on simulations",
+    "fine-tuned NPE": "NPE, trained further on the labels",
+    "discrepancy": "NPE of simulations that a linear model of the discrepancy corrects",
+    "discrepancy, fine-tuned": "NPE of corrected simulations, trained further on the "
+    "labels",
+    "regression": "the labels alone, without the simulator",
+    "discrepancy, with x_o": "NPE of simulations that a linear model corrects, learned "
+    "from observations without labels, too",
+}
+# A sentence, and whether it is alarming.
+Line = tuple[str, bool]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -84,7 +104,8 @@ class StackingReport:
     A candidate is scored at pairs of a fold by the version that was trained without
     this fold, and the stack at these pairs has the weights fitted to the other folds.
     With few pairs these weights still depend a little on the labels of the fold. What
-    is deployed is the average of all versions. Print the report for what it found.
+    is deployed is the average of all versions, which is usually a little wider. Print
+    the report for what it found.
 
     With labels that are not exact, scores are log densities of the labels, and ranks
     are those of the labels, NaN where a parameter was not measured. Scores of labels
@@ -93,16 +114,18 @@ class StackingReport:
     Attributes:
         names: The names of the K candidates.
         families: The method of each candidate.
+        weights: The weights of the candidates, fitted to all pairs, shape ``(K,)``.
         log_scores: The log density of the true parameters under each candidate, shape
             ``(n, K)``, not corrected for mass outside the prior.
+        comparable_scores: That under the stack, not corrected either, shape ``(n,)``.
+            For NPE on real data the correction may not end.
         fold: The fold of each pair, shape ``(n,)``.
-        num_trained_on: The mean number of pairs that the candidates were trained on.
         held_out: The scores of the stack at all pairs. Its density is normalised inside
             the support of the prior.
         set_scores: The scores that sets with a guarantee are made from; None if no
             label is exact.
-        score_errors: The Monte-Carlo error of each score, if labels are not exact.
         labels: What is known of labels that are not exact, or weighted, in words.
+        are_exact: Whether all labels are exact.
         learning_curve: The learning curve of the stack, if it was asked for.
         batch: How ``x_o`` compares with the observations of the pairs; None without it,
             or with fewer than five of either.
@@ -112,18 +135,20 @@ class StackingReport:
             drawn from the prior, see :func:`~sbi_rope.discrepancy.learn_parameters`.
         keep_prior: The names of the candidates that do not learn from the pairs how
             parameters are distributed.
-        provenance: How it was made, in words: seed, seconds, simulator calls, versions.
+        provenance: How it was made, in words: seed, seconds, simulator calls, and the
+            default candidates that the data do not allow.
     """
 
     names: tuple[str, ...]
     families: tuple[str, ...]
+    weights: Tensor
     log_scores: Tensor = field(repr=False)
+    comparable_scores: Tensor = field(repr=False)
     fold: Tensor = field(repr=False)
-    num_trained_on: int
     held_out: Evaluation
     set_scores: SetScores | None = field(default=None, repr=False)
-    score_errors: Tensor | None = field(default=None, repr=False)
     labels: str = ""
+    are_exact: bool = True
     learning_curve: LearningCurve | None = None
     batch: TwoSampleTest | None = None
     discrepancy: DiscrepancyReport | None = None
@@ -131,113 +156,234 @@ class StackingReport:
     keep_prior: tuple[str, ...] = ()
     provenance: dict[str, str] = field(default_factory=dict, repr=False)
 
-    def __len__(self) -> int:
-        return len(self.fold)
-
-    @property
-    def num_folds(self) -> int:
-        """The number of folds."""
-        return int(self.fold.max()) + 1
-
-    @cached_property
-    def weights(self) -> StackingWeights:
-        """The weights of the candidates, fitted to all pairs."""
-        return stacking_weights(self.log_scores, pair_weights=self.held_out.weight)
-
-    @property
-    def family_weights(self) -> dict[str, float]:
-        """The weight of each method, summed over its settings, the largest first."""
-        totals = dict.fromkeys(self.families, 0.0)
-        for family, weight in zip(
-            self.families, self.weights.weights.tolist(), strict=True
-        ):
-            totals[family] += weight
-        return dict(sorted(totals.items(), key=lambda item: -item[1]))
-
-    @cached_property
-    def comparable_scores(self) -> Tensor:
-        """The scores of the stack without correction for mass outside the prior, (n,).
-
-        Those of the candidates are not corrected either: for NPE on real data the
-        correction may not end.
-        """
-        weights = fold_weights(self.log_scores, self.fold, self.held_out.weight)
-        return torch.logsumexp(self.log_scores + weights[self.fold].log(), dim=1)
-
-    def scores_of(self, name: str) -> Tensor:
-        """Return the log scores of a candidate, or of "stack", shape ``(n,)``.
-
-        They are not corrected for mass outside the prior.
-
-        Raises:
-            InvalidInputError: If there is no candidate of that name.
-        """
-        if name == "stack":
-            return self.comparable_scores
-        check("name", name, one_of((*self.names, "stack")))
-        return self.log_scores[:, self.names.index(name)]
-
-    def difference(self, name: str, other: str) -> Estimate:
-        """Return by how much a candidate, or "stack", scores higher than another."""
-        return self._gain(self.scores_of(name) - self.scores_of(other))
-
     @property
     def gains(self) -> dict[str, Estimate]:
-        """How much higher the stack scores than the candidates "prior" and "NPE".
+        """How much higher the stack scores than the candidates "NPE" and "prior".
 
         Compared with the prior the stack is normalised, as it is deployed. Compared
         with NPE, which is not, it is not.
         """
+        of_stack = {"NPE": self.comparable_scores, "prior": self.held_out.log_prob}
+        columns = dict(zip(self.names, self.log_scores.unbind(dim=1), strict=True))
         gains = {}
-        if "NPE" in self.names:
-            gains["NPE"] = self.difference("stack", "NPE")
-        if "prior" in self.names:
-            above = self.held_out.log_prob - self.scores_of("prior")
-            gains["prior"] = self._gain(above)
+        for name, scores in of_stack.items():
+            if name in columns:
+                gain = scores - columns[name]
+                # Where both are minus infinity, neither is better.
+                gains[name] = self.held_out.mean(gain.where(~gain.isnan(), 0.0))
         return gains
-
-    def _gain(self, difference: Tensor) -> Estimate:
-        # Where both scores are minus infinity, neither candidate is better.
-        difference = difference.nan_to_num(nan=0.0, posinf=torch.inf, neginf=-torch.inf)
-        return self.held_out.mean(difference)
-
-    @property
-    def score_of_prior_kept(self) -> float | None:
-        """The best score of a candidate that does not learn the prior; None if none."""
-        found = [self.held_out.mean(self.scores_of(k)).mean for k in self.keep_prior]
-        return max(found, default=None)
-
-    @property
-    def monte_carlo_error(self) -> float:
-        """The error of the mean score that comes from labels not being exact."""
-        if self.score_errors is None:
-            return 0.0
-        weight = self.held_out.weight
-        weight = torch.ones_like(self.score_errors) if weight is None else weight
-        return float((weight * self.score_errors).norm() / weight.sum())
 
     def as_rows(self) -> list[dict[str, Any]]:
         """Return a row for each candidate, the best out-of-fold score first.
 
-        The key "score" is the LPP with theta in its own units, and "score_z" that with
-        theta in standard deviations of the prior. Both have a "low" and a "high" end.
+        The key "score" is the LPP with theta in its own units, with the ends
+        "score_low" and "score_high" of its interval, and "score_z" that with theta in
+        standard deviations of the prior.
         """
-        rows, unit = [], self.held_out.log_unit
-        for name, family, weight, scores in zip(
-            self.names,
-            self.families,
-            self.weights.weights.tolist(),
-            self.log_scores.unbind(dim=1),
-            strict=True,
+        rows, held_out = [], self.held_out
+        names = zip(self.names, self.families, self.weights.tolist(), strict=True)
+        for (name, family, weight), scores in zip(
+            names, self.log_scores.unbind(dim=1), strict=True
         ):
-            row: dict[str, Any] = {"candidate": name, "family": family}
-            row["weight"] = weight
-            for key, values in (("score", scores), ("score_z", scores + unit)):
-                found = self.held_out.mean(values)
-                row |= {key: found.mean, f"{key}_low": found.low}
-                row[f"{key}_high"] = found.high
+            row = {"candidate": name, "family": family, "weight": weight}
+            one = held_out.mean(scores)
+            row |= {"score": one.mean, "score_low": one.low, "score_high": one.high}
+            row["score_z"] = held_out.mean(scores + held_out.log_unit).mean
             rows.append(row)
         return sorted(rows, key=lambda row: -row["score"])
 
     def __str__(self) -> str:
-        return text_of(self, sections_of(self))
+        lines = [headline(self)]
+        for title, sentences in sections_of(self):
+            lines.append(f"\n{title}")
+            for text, _ in sentences:
+                lines += textwrap.wrap(
+                    text, 80, initial_indent="  ", subsequent_indent="    "
+                )
+        if made := self.provenance:
+            lines.append(
+                f"\nMade in {made['seconds']} seconds with {made['simulator calls']} "
+                "calls of the simulator."
+            )
+        return "\n".join(lines)
+
+
+# What it says, in text and on its page ------------------------------------------------
+
+
+def headline(report: StackingReport) -> str:
+    """Say what was scored on what."""
+    group = report.held_out.group
+    groups = "" if group is None else f" in {len(group.unique())} groups"
+    return (
+        f"Stack of {len(report.names)} candidates, scored on {len(report.fold)} "
+        f"hold-out calibration pairs{groups}"
+    )
+
+
+def sections_of(report: StackingReport) -> list[tuple[str, list[Line]]]:
+    """Return the questions of a reader, and the sentences that answer each."""
+    return [
+        ("Did it help?", [*_help(report)]),
+        ("May the intervals be trusted?", [*_trust(report)]),
+        ("What is wrong with the simulator?", [*_simulator(report)]),
+        ("Would more labels help?", [*_more_labels(report)]),
+    ]
+
+
+def _help(report: StackingReport) -> Iterator[Line]:
+    for name, gain in report.gains.items():
+        yield _compared(REFERENCES[name], gain), gain.high < 0
+    held_out = report.held_out
+    score, where = held_out.lpp, "with theta in its own units"
+    if held_out.ranks.isnan().all():
+        where = "relative to that of the prior"
+    elif not math.isnan(held_out.lpp_z.mean):
+        score, where = held_out.lpp_z, "with theta in standard deviations of the prior"
+    yield f"The log density of the labels is {score:.2f} nats a pair {where}.", False
+    yield _weights(report)
+    if report.labels:
+        text = f"Known were {report.labels}."
+        if not report.are_exact:
+            text += " Scores and coverage are those of the labels, with their noise."
+        yield text, False
+
+
+def _compared(other: str, gain: Estimate) -> str:
+    """Say how the stack compares with a reference, no more than the interval shows."""
+    if abs(gain.mean) >= INCOMPARABLE:
+        return f"{other} cannot be compared: its density there is arbitrary."
+    if gain.low <= 0 <= gain.high:
+        start = f"Not shown to differ from {other}"
+    else:
+        kind = "better" if gain.low > 0 else "worse"
+        kind = f"slightly {kind}" if abs(gain.mean) < SLIGHT else kind
+        start = f"{kind.capitalize()} than {other}"
+    return f"{start}: {gain:+.2f} nats a pair (95% interval)."
+
+
+def _weights(report: StackingReport) -> Line:
+    totals = dict.fromkeys(report.families, 0.0)
+    for family, weight in zip(report.families, report.weights.tolist(), strict=True):
+        totals[family] += weight
+    totals = dict(sorted(totals.items(), key=lambda item: -item[1]))
+    listed = []
+    for family, weight in totals.items():
+        count = report.families.count(family)
+        several = f" ({count} candidates)" if count > 1 else ""
+        if weight >= SMALL_WEIGHT:
+            listed.append(f"{family} {weight:.0%}{several}")
+    family, weight = next(iter(totals.items()))
+    if weight < 0.5:
+        return f"No method has half of the weight: {'; '.join(listed)}.", False
+    text = f"Weights: {'; '.join(listed)}."
+    if family in METHODS:
+        text += f" Mostly {METHODS[family]}."
+    if family == "prior":
+        text += " Check that rows of theta and x belong together."
+    return text, family == "prior"
+
+
+def _trust(report: StackingReport) -> Iterator[Line]:
+    held_out = report.held_out
+    if held_out.ranks.isnan().all():
+        yield "Coverage is not known for labels that are given as draws.", False
+        return
+    known = "parameters" if report.are_exact else "labels"
+    yield from held_out.lines(known=known)
+    if (
+        verdict_of(held_out.acauc) == "over-confident"
+        and held_out.num_independent >= FEWEST
+    ):
+        advice = "Collect more labels, or ask for intervals with `guaranteed=True`."
+        yield advice, True
+    if is_improbable(report.probability_of_prior):
+        yield _prior(report), True
+    scores = report.set_scores
+    if scores is not None and rank_needed(LEVEL, len(scores)) <= len(scores):
+        needed = scores.level_needed(LEVEL)
+        size = f"as large as the posterior's own {needed:.0%} sets"
+        if needed > 0.995:
+            size = "larger than almost all draws"
+        text = (
+            f"{LEVEL:.0%} sets of all parameters together hold "
+            f"{scores.share_held(LEVEL):.0%} of the exact labels; with a guarantee "
+            f"(`guaranteed=True`) they are {size}."
+        )
+        yield text, False
+    yield _assumption(report.batch)
+
+
+def _prior(report: StackingReport) -> str:
+    """Say what follows if the parameters of the pairs do not follow the prior."""
+    text = (
+        "The labels are not distributed like the prior (probability that they are: "
+        f"{report.probability_of_prior:.1g}). "
+    )
+    if len(report.keep_prior) == len(report.names):
+        return f"{text}Scores and coverage hold for parameters like these."
+    return (
+        f"{text}The stack expects the same of new observations. For others use "
+        "`candidates=default_candidates(rope, learn_prior=False)`."
+    )
+
+
+def _assumption(batch: TwoSampleTest | None) -> Line:
+    start = "This holds for observations like those of the pairs"
+    look = "`diagnose(rope, x_o, posterior=posterior)`"
+    if batch is None:
+        return f"{start}; {look} tests others.", False
+    if not batch.is_different:
+        return f"{start}; `x_o` is like them (p = {batch.p_value:.2f}).", False
+    text = (
+        "This need not hold for `x_o`, which differs from the pairs (p = "
+        f"{batch.p_value:.3f}); look at {look}."
+    )
+    return text, True
+
+
+def _simulator(report: StackingReport) -> Iterator[Line]:
+    if (found := report.discrepancy) is None:
+        text = (
+            "Not tested: x is no complete vector of at most 20 numbers, or no "
+            "discrepancy model is in the stack. `DiscrepancyNPE` compares longer ones."
+        )
+        yield text, False
+        return
+    off = [one for one in found.summaries if one.is_off]
+    if off:
+        worst = "; ".join(
+            f"{one.name} by {one.size.median:.2g} (shift {one.shift.median:.2g}, gain "
+            f"{one.gain.median:.2g})"
+            for one in off[:MAX_ENTRIES]
+        )
+        others = "; and others" if len(off) > MAX_ENTRIES else ""
+        text = (
+            f"{len(off)} of {len(found.summaries)} entries of x are off, in standard "
+            f"deviations of simulations: {worst}{others}. Print `report.discrepancy` "
+            "for intervals."
+        )
+        yield text, True
+    else:
+        yield "No entry of x shows a discrepancy.", False
+    for note in found.notes:
+        yield note, False
+
+
+def _more_labels(report: StackingReport) -> Iterator[Line]:
+    if (curve := report.learning_curve) is None:
+        yield "Not tested: `stack(rope, learning_curve=True)` estimates it.", False
+        return
+    first, *others = curve.scores
+    points = ", ".join(
+        f"{one.mean - first.mean:+.2f} nats with {n}"
+        for n, one in zip(curve.num_pairs[1:], others, strict=True)
+    )
+    start = f"Compared with training on {curve.num_pairs[0]} pairs"
+    yield f"{start}: {points or 'unknown'}.", False
+    kind = "labels" if curve.evaluations[0].group is None else "groups"
+    for more in dict.fromkeys((FEW_MORE, curve.num_labels)):
+        gain = curve.gain(more)
+        if math.isfinite(gain.mean):
+            text = f"{more} more {kind} might add {gain:.2f} nats a pair, if the curve "
+            yield f"{text}goes on like a - b / n.", False

@@ -4,7 +4,6 @@ import copy
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
-from unittest.mock import patch
 
 import pytest
 import torch
@@ -21,7 +20,7 @@ from sbi_rope.stacking import (
     UnlabelledCandidate,
     candidates,
 )
-from sbi_rope.stacking.candidates import corrected, tuned
+from sbi_rope.stacking.candidates import started, tuned
 from sbi_rope.utils.seeds import seeded
 from tests import problems
 from tests.stacks import BOX, CANDIDATES, data_of, observed, problem, quick, rope_of
@@ -105,28 +104,21 @@ def test_it_learns_from_the_rows_that_it_may_see(candidate: Candidate) -> None:
 
 
 @each
-def test_every_version_has_a_density_of_its_own(candidate: Candidate) -> None:
-    data = data_of(rope_of(problem(16, seed=1)))
-    versions = [data.without(0), data.every]
-    densities = fitted(candidate, data, versions)
-    assert len(densities) == 2
-    assert all(isinstance(density, Density) for density in densities)
-    for density in densities:
+def test_every_version_has_a_density_that_follows_from_the_seed(
+    candidate: Candidate,
+) -> None:
+    rope, found = rope_of(problem(16, seed=1)), []
+    for state in (1, 2):
+        torch.manual_seed(state)
+        data = data_of(rope)
+        found.append(fitted(candidate, data, [data.without(0), data.every]))
+    for density, again in zip(*found, strict=True):
+        assert isinstance(density, Density)
         assert log_probs(density).shape == (3, 7)
+        assert torch.equal(log_probs(density), log_probs(again))
         draws = density.sample(torch.Size((5,)), observed(4))
         assert draws.shape == (5, 4, 2)
         assert draws.isfinite().all()
-
-
-@each
-def test_the_seed_decides_and_not_the_state_of_torch(candidate: Candidate) -> None:
-    rope, found = rope_of(problem(12, seed=1)), []
-    for state in (1, 2):
-        torch.manual_seed(state)
-        data = data_of(rope, num_folds=3)
-        [density] = fitted(candidate, data, [data.without(0)])
-        found.append(log_probs(density))
-    assert torch.equal(*found)
 
 
 @pytest.mark.parametrize("candidate", LEARNING, ids=lambda one: one.name)
@@ -135,7 +127,7 @@ def test_a_single_fold_or_person_is_enough(candidate: Candidate) -> None:
     data = data_of(rope_of(problem(24, seed=1)))
     [density] = fitted(candidate, data, [data.folds[2]])
     assert log_probs(density).isfinite().any()
-    assert len(data.parts(data.folds[2])) > 1
+    assert len(data.holdouts(data.folds[2])) > 1
     theta, x = problem(2, seed=1)
     data = data_of(rope_of((theta.repeat(4, 1), x.repeat(4, 1))), num_folds=2)
     assert data.holdouts(data.folds[0]) == []
@@ -146,32 +138,38 @@ def test_a_single_fold_or_person_is_enough(candidate: Candidate) -> None:
 # --- who is held out ---
 
 
+@pytest.fixture
+def splits(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Tensor, Tensor]]:
+    """What each fine-tuning trains on and holds out, in the order of the flows."""
+    found: list[tuple[Tensor, Tensor]] = []
+
+    def spied(flow: Any, labels: Any, x: Any, some: Any, **options: Any) -> Any:
+        found.extend(some)
+        return finetune_flow(flow, labels, x, some, **options)
+
+    monkeypatch.setattr(candidates, "finetune_flow", spied)
+    return found
+
+
 def test_recordings_of_a_person_are_never_both_trained_on_and_held_out(
-    monkeypatch: pytest.MonkeyPatch,
+    splits: list[tuple[Tensor, Tensor]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """There are nine people, three recordings of each, in mixed order."""
     (theta, x), order = problem(9, seed=4), torch.randperm(27)
     x = x.repeat(3, 1) + 0.1 * torch.randn(27, 3)
     data = data_of(rope_of((theta.repeat(3, 1)[order], x[order])))
     people = data.pairs.group
-    splits: list[tuple[Tensor, Tensor]] = []
     sets: list[Tensor] = []
-
-    def spied_flow(flow: Any, labels: Any, x: Any, some: Any, **options: Any) -> Any:
-        splits.extend(some)
-        return finetune_flow(flow, labels, x, some, **options)
-
     tuning = CalibrationFinetuner.tuned
 
-    def spied_tuning(
+    def spied(
         self: Any, h: Any, x: Any, targets: Any, some: Any, **options: Any
     ) -> Any:
         sets.extend(some)
         assert torch.equal(options["groups"], people)
         return tuning(self, h, x, targets, some, **options)
 
-    monkeypatch.setattr(candidates, "finetune_flow", spied_flow)
-    monkeypatch.setattr(CalibrationFinetuner, "tuned", spied_tuning)
+    monkeypatch.setattr(CalibrationFinetuner, "tuned", spied)
     versions = [data.without(k) for k in range(4)] + [data.every]
     for candidate in (FinetunedCandidate(), FinetunedCandidate(space="tuned")):
         fitted(candidate, data, versions)
@@ -187,55 +185,44 @@ def test_recordings_of_a_person_are_never_both_trained_on_and_held_out(
 
 
 def test_with_rehearsal_every_part_is_held_out_by_another_version(
+    splits: list[tuple[Tensor, Tensor]],
+) -> None:
+    data = data_of(rope_of(problem(12, seed=1)))
+    versions = [data.without(k) for k in range(4)] + [data.every]
+    fitted(FinetunedCandidate(rehearse=True), data, versions)
+    of_rows = {tuple(fold.tolist()): k for k, fold in enumerate(data.folds)}
+    held_out = [of_rows[tuple(part.tolist())] for _, part in splits]
+    assert held_out == [1, 2, 3, 0, 0]
+
+
+def test_tuned_nets_have_not_seen_the_pairs_that_they_embed_or_start_from(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     data = data_of(rope_of(problem(12, seed=1)))
-    held_out: list[Tensor] = []
-
-    def spied(flow: Any, labels: Any, x: Any, some: Any, **options: Any) -> Any:
-        held_out.extend(part for _, part in some)
-        assert options["rehearsed"] is data.simulations
-        return finetune_flow(flow, labels, x, some, **options)
-
-    monkeypatch.setattr(candidates, "finetune_flow", spied)
-    versions = [data.without(k) for k in range(4)] + [data.every]
-    fitted(FinetunedCandidate(rehearse=True), data, versions)
-    number = [
-        next(k for k, fold in enumerate(data.folds) if torch.equal(fold, part))
-        for part in held_out
-    ]
-    assert number == [1, 2, 3, 0, 0]
-
-
-def test_pairs_are_embedded_by_tuned_nets_that_have_not_seen_them() -> None:
-    data = data_of(rope_of(problem(12, seed=1)))
-    version = data.without(1)
-    with quick():
-        nets = tuned(data, [version])
-        z = nets.held_out(version, data)
-    for number, part in zip(nets.of(version, data), data.parts(version), strict=True):
-        [seen] = [rows for rows, own in nets.number.items() if own == number]
-        assert {*seen[0]} == {*version.tolist()} - {*part.tolist()}
-        expected = embed(nets.nets.member(number), data.pairs.x[part])
-        assert torch.allclose(z[torch.isin(version, part)], expected, atol=1e-5)
-
-
-def test_fine_tuning_starts_behind_the_tuned_net_without_the_held_out_part() -> None:
-    data = data_of(rope_of(problem(12, seed=1)))
     versions, x = [data.without(0), data.every], data.pairs.x
-    found: list[Tensor] = []
+    made: list[Any] = []
+    starts: list[Tensor] = []
 
-    def spied(flow: Flow, *rest: Any, **options: Any) -> Any:
-        found.append(flow.embed(x))
+    def spied_nets(*args: Any) -> Any:
+        made.append(tuned(*args))
+        return made[0]
+
+    def spied_flow(flow: Flow, *rest: Any, **options: Any) -> Any:
+        starts.append(flow.embed(x))
         return finetune_flow(flow, *rest, **options)
 
-    with quick(), seeded(0), patch.object(candidates, "finetune_flow", spied):
-        FinetunedCandidate(space="tuned").fit(data, versions)
-        nets = tuned(data, versions)
-    numbers = [number for rows in versions for number in nets.of(rows, data)]
-    expected = torch.stack([nets.nets.member(k)(x) for k in numbers], dim=1)
+    monkeypatch.setattr(candidates, "tuned", spied_nets)
+    monkeypatch.setattr(candidates, "finetune_flow", spied_flow)
+    fitted(FinetunedCandidate(space="tuned"), data, versions)
+    [(nets, numbers, embedded)] = made
+    # Each flow starts behind the net that was tuned without the part it holds out.
+    expected = torch.stack([nets.member(k)(x) for k in numbers], dim=1)
     assert expected.shape[1] == 3 + 4
-    assert torch.allclose(found[0], expected, atol=1e-5)
+    assert torch.allclose(starts[0], expected, atol=1e-5)
+    parts = [(v, part) for v in (0, 1) for _, part in data.holdouts(versions[v])]
+    for number, (version, part) in zip(numbers, parts, strict=True):
+        z = embed(nets.member(number), x[part])
+        assert torch.allclose(embedded[version][part], z, atol=1e-5)
 
 
 # --- losses ---
@@ -286,12 +273,12 @@ def test_a_version_is_corrected_by_the_discrepancy_of_its_rows() -> None:
     data = data_of(rope_of(problem(16, seed=1)), num_folds=2)
     moved = data.pairs.x.index_add(0, data.folds[0], torch.full((8, 3), 2.0))
     data.pairs = replace(data.pairs, x=moved)
-    found = corrected(data, data.folds, "input", learn_prior=False).flow
+    flow, numbers = started(data, data.folds, "input", learn_prior=False)
     theta, x = problem(200, seed=9)
     for version in (0, 1):
-        with torch.no_grad():
-            own, other = (
-                float(found[[version]].log_prob(theta[None], x + 2.0 * kind).mean())
-                for kind in (version == 0, version == 1)
-            )
+        density = flow[numbers[version]]
+        own, other = (
+            float(density.log_prob(theta[None], x + 2.0 * kind).mean())
+            for kind in (version == 0, version == 1)
+        )
         assert own > other + 0.3

@@ -23,6 +23,7 @@ from tests.stacks import (
     observed,
     problem,
     rope_of,
+    scores_of,
     stacked,
     validated,
 )
@@ -47,7 +48,6 @@ def test_a_stack_is_scored_on_what_was_measured(tmp_path: Any) -> None:
     scores = posterior.report
     assert torch.isfinite(scores.log_scores).all()
     assert torch.equal(torch.isnan(scores.held_out.levels), torch.isnan(PARTIAL))
-    assert 0 < scores.monte_carlo_error < 0.2
     # In standard deviations of the prior, each parameter that was measured counts.
     units = PriorDistribution(rope.npe.prior).log_units()
     in_units = scores.held_out.log_prob + (~torch.isnan(PARTIAL)).to(units) @ units
@@ -106,7 +106,9 @@ def test_labels_given_as_draws_are_scored_relative_to_the_prior() -> None:
     draws = (THETA[:, None] + 0.05 * torch.randn(NUM_PAIRS, 30, 2)).clamp(-0.99, 0.99)
     posterior = stacked(labelled(draws), candidates=[PRIOR, NPE])
     scores = posterior.report
-    assert torch.allclose(scores.scores_of("prior"), torch.zeros(1).double(), atol=1e-5)
+    assert torch.allclose(
+        scores_of(scores, "prior"), torch.zeros(1).double(), atol=1e-5
+    )
     assert torch.isnan(scores.held_out.levels).all()
     text = " ".join(str(posterior.report).split())
     assert "Coverage is not known" in text
@@ -149,9 +151,10 @@ def test_the_weights_of_pairs_decide_for_the_candidate_that_they_favour() -> Non
         conductor = rope_of(problem(0, seed=1))
         conductor.append_calibration(theta, x, weights=weights)
         scores = validated(conductor, candidates=[PRIOR, NPE])
-        found.append(float(scores.weights.weights[1]))
-        mean = scores.held_out.mean(scores.scores_of("NPE")).mean
-        expected = (weights * scores.scores_of("NPE")).sum() / weights.sum()
+        found.append(float(scores.weights[1]))
+        of_npe = scores_of(scores, "NPE")
+        mean = scores.held_out.mean(of_npe).mean
+        expected = (weights * of_npe).sum() / weights.sum()
         assert math.isclose(mean, float(expected), rel_tol=1e-6)
     assert found[0] > found[1] + 0.2
 

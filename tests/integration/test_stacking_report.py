@@ -1,11 +1,11 @@
 """The report of a stack as text, as a page and as a picture, against its numbers."""
 
 import base64
+import html
 import math
 import re
 import warnings
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -13,7 +13,7 @@ from unittest.mock import patch
 import pytest
 import scipy.stats
 import torch
-from torch.distributions import Cauchy, Distribution, Independent, MultivariateNormal
+from torch.distributions import Cauchy, Independent, MultivariateNormal
 
 from sbi_rope import diagnose, load, plots, stack
 from sbi_rope.discrepancy import DiscrepancyModel
@@ -36,6 +36,7 @@ from tests.stacks import (
     problem,
     quick,
     rope_of,
+    scores_of,
     stacked,
     the_stack,
     trained,
@@ -55,6 +56,7 @@ def made_up(
     npe: float = -4.0,
     best: float = -1.0,
     leak: float = 0.2,
+    weights: list[float] | None = None,
     **options: Any,
 ) -> StackingReport:
     """A report of made-up numbers."""
@@ -70,9 +72,10 @@ def made_up(
     return StackingReport(
         names=CANDIDATES,
         families=("prior", "NPE", "discrepancy", "discrepancy"),
+        weights=torch.tensor([0.1, 0.0, 0.3, 0.6] if weights is None else weights),
         log_scores=log_scores,
+        comparable_scores=log_scores[:, 2],
         fold=torch.arange(n) % 3,
-        num_trained_on=2 * n // 3,
         held_out=Evaluation(**held_out | options),
     )
 
@@ -88,9 +91,9 @@ def flat(report: StackingReport) -> str:
 def test_gains_are_mean_differences_of_comparable_scores() -> None:
     report = made_up(leak=0.2)
     # The prior has no mass outside itself, and is compared with what is deployed.
-    of_stack = {"prior": report.held_out.log_prob, "NPE": report.scores_of("stack")}
+    of_stack = {"NPE": report.comparable_scores, "prior": report.held_out.log_prob}
     for name, of_pairs in of_stack.items():
-        difference = (of_pairs - report.scores_of(name)).numpy()
+        difference = (of_pairs - scores_of(report, name)).numpy()
         low, high = scipy.stats.t.interval(
             0.95, df=11, loc=difference.mean(), scale=scipy.stats.sem(difference)
         )
@@ -100,7 +103,6 @@ def test_gains_are_mean_differences_of_comparable_scores() -> None:
         )
         assert f"{gain:+.2f} nats a pair" in flat(report)
     assert "Better than the prior" in flat(report)
-    assert "of it come from the correction for mass outside" in flat(report)
 
 
 @pytest.mark.parametrize(
@@ -128,7 +130,10 @@ def test_scores_are_stated_in_standard_deviations_of_the_prior() -> None:
     score, score_z = report.held_out.lpp, report.held_out.lpp_z
     assert vars(score_z) == pytest.approx({k: v + unit for k, v in vars(score).items()})
     assert f"{score_z:.2f} nats a pair with theta in standard" in flat(report)
-    for row in report.as_rows():
+    rows = report.as_rows()
+    assert rows == sorted(rows, key=lambda row: -row["score"])
+    assert {row["candidate"] for row in rows} == {*report.names}
+    for row in rows:
         assert math.isclose(row["score_z"], row["score"] + unit, rel_tol=1e-6)
     # Without the prior's standard deviations there is one unit only.
     assert "with theta in its own units" in flat(made_up())
@@ -137,62 +142,33 @@ def test_scores_are_stated_in_standard_deviations_of_the_prior() -> None:
 class Unstated(MultivariateNormal):
     """A prior that does not state its standard deviation."""
 
-    @property
-    def stddev(self) -> torch.Tensor:
-        raise NotImplementedError
-
-
-def log_unit(prior: Distribution) -> float:
-    return float(PriorDistribution(prior).log_units().sum())
+    stddev = property()
 
 
 def test_the_unit_of_a_prior_is_estimated_from_draws_or_unknown() -> None:
     covariance = torch.diag(torch.tensor([4.0, 0.01]))
-    stated = log_unit(MultivariateNormal(torch.zeros(2), covariance))
-    assert math.isclose(stated, math.log(2.0) + math.log(0.1), abs_tol=1e-6)
-    estimated = log_unit(Unstated(torch.zeros(2), covariance))
-    assert math.isclose(estimated, stated, abs_tol=0.05)
     heavy = Independent(Cauchy(torch.zeros(2), torch.ones(2)), 1)
-    assert math.isnan(log_unit(heavy))
+    priors = MultivariateNormal, Unstated
+    stated, estimated, unknown = (
+        float(PriorDistribution(prior).log_units().sum())
+        for prior in (*(one(torch.zeros(2), covariance) for one in priors), heavy)
+    )
+    assert math.isclose(stated, math.log(2.0) + math.log(0.1), abs_tol=1e-6)
+    assert math.isclose(estimated, stated, abs_tol=0.05)
+    assert math.isnan(unknown)
 
 
 def test_weights_of_families_are_summed_and_explained() -> None:
-    report = made_up()
-    weights, found = report.family_weights, report.weights.weights
-    assert next(iter(weights)) == "discrepancy"
-    assert weights["discrepancy"] == pytest.approx(float(found[2:].sum()))
-    assert math.isclose(sum(weights.values()), 1.0, rel_tol=1e-9)
-    assert f"Weights: discrepancy {weights['discrepancy']:.0%} (2 candidates)" in flat(
-        report
-    )
-    assert "Mostly NPE of simulations that a linear model" in flat(report)
-
-
-@pytest.mark.parametrize("family", ["NPE", "prior"])
-def test_rows_are_to_be_checked_if_the_stack_is_mostly_the_prior(
-    family: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(StackingReport, "family_weights", {family: 0.9, "box": 0.1})
-    expected = "Check that rows of theta and x belong together." in flat(made_up())
-    assert expected == (family == "prior")
-
-
-def test_rows_are_sorted() -> None:
-    report = the_stack().report
-    scores = [row["score"] for row in report.as_rows()]
-    assert scores == sorted(scores, reverse=True)
-    assert {row["candidate"] for row in report.as_rows()} == {*report.names}
+    text = flat(made_up())
+    assert "Weights: discrepancy 90% (2 candidates); prior 10%." in text
+    assert "Mostly NPE of simulations that a linear model" in text
+    advice = "Check that rows of theta and x belong together."
+    assert advice not in text
+    assert advice in flat(made_up(weights=[0.7, 0.1, 0.1, 0.1]))
+    assert "No method has half" in flat(made_up(weights=[0.4, 0.4, 0.1, 0.1]))
 
 
 # Calibration --------------------------------------------------------------------------
-
-
-def test_calibration_is_that_of_hold_out_pairs() -> None:
-    held_out = the_stack().report.held_out
-    text = flat(the_stack().report)
-    assert f"ACAUC {held_out.acauc:+.3f}" in text
-    inside = (held_out.levels <= 0.9).double().mean()
-    assert f"90% intervals {inside:.0%}." in text
 
 
 def test_estimates_and_ranks_are_those_of_hold_out_pairs() -> None:
@@ -204,6 +180,7 @@ def test_estimates_and_ranks_are_those_of_hold_out_pairs() -> None:
         [held_out.ranks.flatten(), (theta - held_out.estimates).flatten()]
     )
     assert float(above.double().corrcoef()[0, 1]) > 0.7
+    assert f"ACAUC {held_out.acauc:+.3f}" in flat(report)
 
 
 def test_the_text_says_what_to_do_about_over_confidence() -> None:
@@ -212,40 +189,17 @@ def test_the_text_says_what_to_do_about_over_confidence() -> None:
     assert "Collect more labels" not in flat(made_up(n=400))
 
 
-def test_parameters_that_are_not_calibrated_by_themselves_are_named() -> None:
-    """One is over-confident and one too wide, so that their mean looks calibrated."""
-    levels = torch.rand(400, 2, generator=torch.Generator().manual_seed(0))
-    opposite = torch.stack([levels[:, 0].sqrt(), levels[:, 1].square()], dim=1)
-    text = flat(made_up(n=400, ranks=(1 + opposite) / 2))
-    assert "Calibrated, on average over parameters, as far as 400 obs" in text
-    assert "theta_1 alone is over-confident: ACAUC +0.1" in text
-    assert "theta_2 alone is too wide: ACAUC -0.1" in text
-
-
-def test_the_text_names_what_calibration_assumes_about_a_batch() -> None:
-    report = made_up()
-    assert "`diagnose(rope, x_o, posterior=posterior)` tests others" in flat(report)
-    like, unlike = (
-        flat(replace(report, batch=TwoSampleTest(p_value=p, spread=0.4)))
-        for p in (0.32, 0.002)
-    )
-    assert "`x_o` is like them (p = 0.32)" in like
-    assert "This need not hold for `x_o`, which differs from the pairs" in unlike
-
-
 @pytest.mark.medium
-def test_a_batch_unlike_the_pairs_gives_a_warning() -> None:
+def test_a_batch_unlike_the_pairs_gives_a_warning_and_is_in_the_text() -> None:
     options = {"candidates": [NPE, PRIOR]}
     with pytest.warns(RoPEWarning, match="differs from the observations of the cal"):
-        report = stacked(rope_of(), observed() + 1.0, **options).report
-    assert report.batch is not None
-    assert report.batch.is_different
+        unlike = stacked(rope_of(), observed() + 1.0, **options).report
+    assert "This need not hold for `x_o`, which differs from the pairs" in flat(unlike)
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message="`x_o` differs")
         like = stacked(rope_of(), observed(), **options).report
-    assert like.batch is not None
-    assert not like.batch.is_different
-    assert the_stack().report.batch is None
+    assert "`x_o` is like them (p = " in flat(like)
+    assert "`diagnose(rope, x_o, posterior=posterior)` tests others" in flat(made_up())
 
 
 def test_a_stack_with_a_discrepancy_says_what_the_pairs_say_about_each_entry() -> None:
@@ -266,25 +220,14 @@ def test_a_report_names_pairs_whose_parameters_do_not_follow_the_prior() -> None
     theta = 0.2 * problem(20, seed=1)[0]
     middle = rope_of((theta, problems.simulate(theta) + 0.4))
     found = stacked(middle, candidates=[PRIOR, NPE, DISCREPANCY]).report
-    assert found.probability_of_prior is not None
-    assert found.probability_of_prior < 1e-3
     text = flat(found)
     assert "labels are not distributed like the prior" in text
     assert "The stack expects the same of new observations" in text
     assert "default_candidates(rope, learn_prior=False)" in text
-    # What keeping it would score: the better of the prior and NPE.
-    best = max(float(found.scores_of(name).mean()) for name in ("prior", "NPE"))
-    assert found.score_of_prior_kept == pytest.approx(best)
-    less = best - float(found.scores_of("stack").mean())
-    assert f"keeps the prior is {less:+.2f} nats from the stack here" in text
     kept = flat(stacked(middle, candidates=[PRIOR, NPE]).report)
     assert "Scores and coverage hold for parameters like these" in kept
     assert "learn_prior=False" not in kept
-    # These pairs follow the prior.
-    usual = the_stack().report
-    assert usual.probability_of_prior is not None
-    assert usual.probability_of_prior > 0.5
-    assert "not distributed like the prior" not in flat(usual)
+    assert "not distributed like the prior" not in flat(the_stack().report)
 
 
 # Groups -------------------------------------------------------------------------------
@@ -443,12 +386,11 @@ def calls_of(report: StackingReport) -> int:
 
 def test_the_provenance_names_default_candidates_that_the_data_do_not_allow() -> None:
     made = stacked(rope_of(problem(8, seed=1))).report.provenance
-    assert "regression (needs 10 exact labels of continuous" in made["left out"]
+    assert "regression; regression (embedding)" in made["left out"]
     # Candidates that a user has chosen leave nothing out.
     chosen = stacked(rope_of(), candidates=[PRIOR]).report.provenance
-    assert "left out" not in chosen
+    assert chosen["left out"] == "none"
     assert chosen["seed"] == "0"
-    assert f"torch {torch.__version__}" in chosen["versions"]
 
 
 @pytest.mark.medium
@@ -462,43 +404,11 @@ def test_names_of_parameters_are_given_once(tmp_path: Path) -> None:
     assert load(tmp_path / "stack.pt").report.held_out.names == ("slope", "size")
     found = diagnose(named, x, num_simulations=100, num_folds=None, **QUIET)
     assert found.parameter_names == ("slope", "size")
-    for names in (("slope",), ("a", "a"), ("a", "b", "c")):
-        with pytest.raises(InvalidInputError, match="2 different names"):
-            rope_of(parameter_names=names)
+    with pytest.raises(InvalidInputError, match="2 different names"):
+        rope_of(parameter_names=("a", "a"))
 
 
 # The page -----------------------------------------------------------------------------
-
-
-class Page(HTMLParser):
-    """Reads a page, and fails where an element is not closed as it was opened."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.tags: list[str] = []
-        self.links: list[str] = []
-        self.words: list[str] = []
-        self.feed(text)
-        self.close()
-        assert not self.open
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
-        self.links += [v or "" for name, v in attrs if name in ("src", "href")]
-        if tag not in {"meta", "img", "br"}:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        if self.open and self.open[-1] != "style":
-            self.words.append(data)
-
-    @property
-    def text(self) -> str:
-        return re.sub(r"\s+", " ", " ".join(self.words))
 
 
 def written(report: StackingReport, folder: Path, **options: object) -> str:
@@ -529,38 +439,41 @@ def test_a_page_says_what_printing_says_and_needs_no_other_file(
         parameter_names=NAMES,
         x_names=("left", "right", "<top>"),
     )
-    page = Page(source)
     assert source.startswith("<!DOCTYPE html>\n<html lang=")
-    assert {"title", "style", "table", "section", "img"} <= set(page.tags)
-    assert not {"script", "link", "iframe"} & set(page.tags)
+    tags = re.findall(r"<(\w+)", source)
+    for tag in ("table", "section", "p"):
+        assert tags.count(tag) == source.count(f"</{tag}>") > 0
+    assert not {"script", "link", "iframe"} & {*tags}
     # Pictures are part of the page, and neither they nor the style load anything.
-    assert len(page.links) == 3
-    for link in page.links:
+    links = re.findall(r'(?:src|href)="([^"]*)"', source)
+    assert len(links) == 3
+    for link in links:
         data = base64.b64decode(link.partition("base64,")[2], validate=True)
         assert data.startswith(b"\x89PNG")
         assert b"http" not in data
     assert "http" not in re.sub(r"base64,[^\"]*", "", source)
     # Names are text and no elements.
     assert "<kg>" not in source
+    words = " ".join(html.unescape(re.sub(r"<[^>]*>", " ", source)).split())
     for name in ("left", "<top>"):
-        assert name in page.text
-    assert "This need not hold for x_o" in page.text
-    assert f"The coverage of {NAMES[0]} depends on its estimate" in page.text
+        assert name in words
+    assert "This need not hold for x_o" in words
+    assert f"The coverage of {NAMES[0]} depends on its estimate" in words
     for gain in report.gains.values():
-        assert f"{gain:+.2f} nats a pair" in page.text
+        assert f"{gain:+.2f} nats a pair" in words
     for row in report.as_rows():
-        assert f"{row['candidate']} " in page.text
-        assert f"{row['score_z']:.2f}" in page.text
+        assert f"{row['candidate']} " in words
+        assert f"{row['score_z']:.2f}" in words
     for finding in diagnosis.findings:
-        assert finding.sentence.replace("`", "") in page.text
+        assert finding.sentence.replace("`", "") in words
     for what, value in report.provenance.items():
-        assert f"{what} {value}" in page.text
+        assert f"{what} {value}" in words
 
 
 def test_names_that_do_not_fit_are_refused(tmp_path: Path) -> None:
-    report, path = the_stack().report, tmp_path / "report.html"
+    report = the_stack().report
     with pytest.raises(InvalidInputError, match="`parameter_names` to be 2"):
-        write_html(report, path, parameter_names=("a",))
+        written(report, tmp_path, parameter_names=("a",))
     with pytest.raises(InvalidInputError, match="Expected `x_names`"):
-        write_html(report, path, x_names=("a", "b"))
-    assert not path.exists()
+        written(report, tmp_path, x_names=("a", "b"))
+    assert not list(tmp_path.iterdir())

@@ -62,7 +62,7 @@ def test_rows_of_a_coupling_are_probabilities_whatever_the_embeddings(
 def test_weights_of_candidates_are_probabilities_whatever_the_scores(
     scores: Tensor,
 ) -> None:
-    weights = stacking_weights(scores).weights
+    weights = stacking_weights(scores)
     assert (weights >= 0).all()
     assert torch.isclose(weights.sum(), torch.ones(()).double())
 
