@@ -93,8 +93,8 @@ class ReferenceNPE(PlainNPE):
         Returns:
             Parameters and simulations, without those that are not finite.
         """
-        theta = self._data.read_theta(theta)
-        shape = self._data.event_shape or torch.Size()
+        theta = self._read_theta(theta)
+        shape = self._event_shape or torch.Size()
         with seeded(seed):
             x = Simulated(simulator, self._prior, event_shape=shape, like=theta)(theta)
         valid = torch.isfinite(x).flatten(1).all(dim=1)
