@@ -1,11 +1,9 @@
 """The discrepancy between a simulator and reality, summary by summary."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
-import torch
+from scipy.stats import t
 from torch import Tensor
 
 from sbi_rope.data.simulate import Moments
@@ -24,10 +22,6 @@ FALSE_ALARMS = 0.01
 EFFICIENCY = 0.37
 # With fewer pairs one cannot tell which of them is the outlier.
 MIN_PAIRS_FOR_OUTLIERS = 10
-# If this share of the pairs are outliers, they are hardly all mistakes of labelling.
-MANY_OUTLIERS = 0.05
-# What is estimated with an interval.
-ESTIMATES = ("size", "shift", "gain", "error")
 
 
 @dataclass(frozen=True)
@@ -41,8 +35,7 @@ class Interval:
     @classmethod
     def of(cls, draws: Tensor) -> "Interval":
         """Return the quantiles of draws, shape ``(m,)``."""
-        levels = torch.tensor([0.5, 0.025, 0.975]).to(draws)
-        return cls(*draws.quantile(levels).tolist())
+        return cls(*draws.quantile(draws.new_tensor([0.5, 0.025, 0.975])).tolist())
 
     def __str__(self) -> str:
         return f"{self.median:.3g} [{self.low:.3g}, {self.high:.3g}]"
@@ -92,7 +85,8 @@ class SummaryDiscrepancy:
 class DiscrepancyReport:
     """The discrepancy of each summary, as estimated from calibration pairs.
 
-    Print it, or use :meth:`as_rows` and :func:`sbi_rope.plots.discrepancy`.
+    Print it, draw it with :func:`sbi_rope.plots.discrepancy`, or make a table of
+    ``dataclasses.asdict(summary)`` for each of its summaries.
 
     Attributes:
         summaries: The discrepancy of each summary, from the largest to the smallest.
@@ -113,31 +107,16 @@ class DiscrepancyReport:
     def renamed(self, names: Sequence[str]) -> "DiscrepancyReport":
         """Return the report of numbered summaries with names, in the order of x."""
         of_entry = {f"x[{j}]": name for j, name in enumerate(names)}
-        known = {*(summary.name for summary in self.summaries), *self.constant}
-        if known != set(of_entry) or len(set(names)) < len(names):
+        count = len(self.summaries) + len(self.constant)
+        if not count == len(names) == len(set(names)):
             raise InvalidInputError(
-                f"Expected `x_names` to be {len(known)} different names, of "
-                f"{sorted(known)}; got {list(names)}."
+                f"Expected `x_names` to be {count} different names; got {list(names)}."
             )
         return replace(
             self,
             summaries=tuple(replace(s, name=of_entry[s.name]) for s in self.summaries),
             constant=tuple(of_entry[name] for name in self.constant),
         )
-
-    def as_rows(self) -> list[dict[str, Any]]:
-        """Return a row for each summary, in the order of ``summaries``."""
-        rows = []
-        for summary in self.summaries:
-            row: dict[str, Any] = {"summary": summary.name}
-            for name in ESTIMATES:
-                ends: Interval = getattr(summary, name)
-                row |= {name: ends.median, f"{name}_low": ends.low}
-                row[f"{name}_high"] = ends.high
-            row["probability_of_none"] = summary.probability_of_none
-            row["outliers"] = list(summary.outliers)
-            rows.append(row | {"num_independent": summary.num_independent})
-        return rows
 
     @property
     def notes(self) -> list[str]:
@@ -146,54 +125,45 @@ class DiscrepancyReport:
         if self.constant:
             notes.append(f"The same in all simulations: {', '.join(self.constant)}.")
         if self.num_groups < self.num_pairs:
-            numbers = {round(summary.num_independent) for summary in self.summaries}
+            numbers = [round(summary.num_independent) for summary in self.summaries]
             count = " to ".join(map(str, sorted({min(numbers), max(numbers)})))
             notes.append(
                 "Pairs of a group can have errors in common. Here, the "
                 f"{self.num_pairs} pairs count as {count} independent ones."
             )
-        outliers: dict[int, list[str]] = {}
-        for summary in self.summaries:
-            for row in summary.outliers:
-                outliers.setdefault(row, []).append(summary.name)
+        outliers = sorted((row, s.name) for s in self.summaries for row in s.outliers)
         if outliers:
-            listed = [f"row {row} ({', '.join(n)})" for row, n in outliers.items()]
-            meaning = (
-                "Look whether a label or a measurement is wrong, or whether reality is "
-                "not linear in the simulation there."
+            listed = ", ".join(f"row {row} ({name})" for row, name in outliers)
+            notes.append(
+                f"Pairs that do not fit the others: {listed}. Look whether a label or "
+                "a measurement is wrong. If they are many, reality is rather not "
+                "linear in the simulation there."
             )
-            if len(outliers) > max(2.0, MANY_OUTLIERS * self.num_pairs):
-                meaning = (
-                    "So many suggest that reality is not linear in the simulation "
-                    "there, rather than that labels are wrong."
-                )
-            pairs = f"Pairs that do not fit the others: {'; '.join(listed)}. {meaning}"
-            notes.append(pairs)
         return notes
 
     def __str__(self) -> str:
         grouped = self.num_groups < self.num_pairs
         in_groups = f" in {self.num_groups} groups" if grouped else ""
+        off = [one for one in self.summaries if one.is_off]
+        fine = [one.name for one in self.summaries if not one.is_off]
         lines = [
             f"What {self.num_pairs} calibration pairs{in_groups} say about the "
             "simulator",
             "  observed = mean + shift + gain (simulated - mean) + error",
         ]
-        rows = [("summary", *ESTIMATES)] + [
-            (s.name, *(str(getattr(s, name)) for name in ESTIMATES))
-            for s in self.summaries
-            if s.is_off
-        ]
-        if len(rows) > 1:
+        if off:
             lines.append(
                 "  95 % intervals; size in standard deviations of simulations, shift "
                 "and error in units of x"
             )
+            heads = ("name", "size", "shift", "gain", "error")
+            rows = [[str(getattr(one, head)) for head in heads] for one in off]
+            rows.insert(0, ["summary", *heads[1:]])
             widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
             lines += [
                 "  " + "  ".join(map(str.ljust, row, widths)).rstrip() for row in rows
             ]
-        if fine := [summary.name for summary in self.summaries if not summary.is_off]:
+        if fine:
             lines.append(f"  no sign of discrepancy: {', '.join(fine)}")
         return "\n".join([*lines, *(f"  {note}" for note in self.notes)])
 
@@ -214,31 +184,28 @@ def report_discrepancy(
     light, is ambiguous. The gain of a single summary is not, and can be checked.
     """
     unit = Standardisation(simulated.double())
-    is_constant = (~unit.varies).tolist()
-    summaries, constant = [], []
+    varying, summaries = unit.varies.nonzero()[:, 0].tolist(), []
+    if not varying:
+        raise InvalidInputError(
+            "Expected simulations that differ from each other; all summaries are "
+            "constant."
+        )
     for j in progress_bar(
-        range(x.shape[1]), show=show_progress_bars, desc="Summaries", delay=DELAY
+        varying, show=show_progress_bars, desc="Summaries", delay=DELAY
     ):
-        if is_constant[j]:
-            constant.append(f"x[{j}]")
-            continue
         mean, std = unit.mean[j], unit.std[j]
         z = ((x[:, j].double() - mean) / std)[:, None]
         m = ((moments.means[..., j] - mean) / std)[..., None]
         noise = moments.covariance[:, j, j].mean() / std.square()
         found = model.fit(z, m, noise.reshape(1, 1), weights=weights, groups=groups)
         summaries.append(_summary(f"x[{j}]", found, z, m, scale=float(std)))
-    if not summaries:
-        raise InvalidInputError(
-            "Expected simulations that differ from each other; all summaries are "
-            "constant."
-        )
     summaries.sort(key=lambda s: (not s.is_off, -s.size.median))
+    constant = (~unit.varies).nonzero()[:, 0].tolist()
     return DiscrepancyReport(
         summaries=tuple(summaries),
         num_pairs=len(x),
         num_groups=len(x) if groups is None else len(groups.unique()),
-        constant=tuple(constant),
+        constant=tuple(f"x[{j}]" for j in constant),
     )
 
 
@@ -273,17 +240,13 @@ def _summary(
 
 def _outliers(residual: Tensor, noise: float) -> tuple[int, ...]:
     """Return the rows of outliers; their standard deviation is at least ``noise``."""
-    n = len(residual)
-    if n < MIN_PAIRS_FOR_OUTLIERS:
+    if (n := len(residual)) < MIN_PAIRS_FOR_OUTLIERS:
         return ()
     distance = (residual - residual.median()).abs()
     # The median distance of a normal variable from its median is 0.6745 standard
     # deviations.
     std = (distance.median() / 0.6745).clamp_min(noise)
     # The furthest of n values exceeds this quantile with a probability of 1 %. The
-    # standard deviation is an estimate, hence Student's t, by Wallace's approximation.
-    level = torch.tensor(1 - FALSE_ALARMS / (2 * n), dtype=torch.double)
-    freedom = EFFICIENCY * (n - 1)
-    score = float(torch.special.ndtri(level)) * (8 * freedom + 3) / (8 * freedom + 1)
-    furthest = math.sqrt(freedom * math.expm1(score**2 / freedom))
-    return tuple((distance > furthest * std).nonzero().flatten().tolist())
+    # standard deviation is an estimate, hence Student's t.
+    furthest = t.isf(FALSE_ALARMS / (2 * n), EFFICIENCY * (n - 1))
+    return tuple((distance > furthest * std).nonzero()[:, 0].tolist())

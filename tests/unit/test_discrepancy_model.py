@@ -365,7 +365,7 @@ def test_simulations_are_corrected_by_gain_offset_and_error() -> None:
 def test_a_draw_can_serve_a_block_of_simulations() -> None:
     z, mean = pairs(40, 2)
     draws = DiscrepancyModel().fit(z, mean, no_noise(2)).sample(6, seed=0)
-    draws = replace(draws, error_factor=torch.zeros_like(draws.error_factor))
+    draws = draws._replace(error_factor=torch.zeros_like(draws.error_factor))
     z_s, chosen = torch.randn(12, 2).double(), torch.tensor([4, 0, 5])
     one_by_one = draws.correct(z_s, chosen.repeat_interleave(4))
     assert torch.allclose(draws.correct(z_s, chosen), one_by_one)
