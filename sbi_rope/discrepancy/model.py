@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from statistics import fmean
-from typing import Any
 
 import numpy as np
 import torch
@@ -146,65 +145,54 @@ class DiscrepancyModel(Settings):
         covariance = as_batch("covariance", covariance, width, rows=width[0]).to(z)
         noise = covariance + rounding(covariance).diag()
         weights = torch.ones(len(z)) if weights is None else weights
-        once = weights = as_batch("weights", weights, (), rows=len(z)).to(z)
+        weights = as_batch("weights", weights, (), rows=len(z)).to(z)
         if groups is not None:
             groups = groups_of(as_batch("groups", groups, (), rows=len(z))).to(z.device)
             groups = None if len(groups.unique()) == len(z) else groups
+        once = weights
         if groups is not None:
-            # Whether the simulator is right is judged with each group as one pair. With
-            # a correlation that is a little too low, a right one would be refuted.
             once = independent_pairs(groups, 1.0, weights)
+        precisions = z.new_tensor(self.gain_precisions)
+        grids = z.new_tensor(self.error_scales), z.new_tensor(self.degrees_of_freedom)
+        settings = torch.cartesian_prod(*grids)
+        regress = partial(Regressions.of, z, noise=noise, settings=settings)
 
         def counts(mean: Tensor) -> Tensor:
+            """Return how many independent pairs each counts as, given B sets."""
             if groups is None:
                 return weights
-            correlations = self._correlations_within(groups, z, mean, noise)
-            return independent_pairs(groups, correlations, weights)
+            ratios, ones = torch.tensor(VARIANCE_RATIOS).to(z), torch.ones_like(weights)
+            correlations = ratios / (1 + ratios)
+            evidence = [
+                # Half of the precisions are enough to compare correlations.
+                regress(
+                    mean, ones, precisions[::2], groups=groups, correlation=one
+                ).log_evidence.logsumexp(dim=(1, 2))
+                for one in correlations.tolist()
+            ]
+            log_prior = torch.tensor(PRIOR_OF_RATIOS).to(z).log()
+            shares = (torch.stack(evidence, dim=1) + log_prior).softmax(dim=1)
+            return independent_pairs(groups, shares @ correlations, weights)
 
-        conditional = partial(self._conditional, z=z, noise=noise, once=once)
+        def conditional(mean: Tensor, weights: Tensor) -> Conditional:
+            """Return the posteriors given B sets of means, shape ``(B, n, l)``."""
+            found = judged = regress(mean, weights, precisions)
+            if groups is not None:
+                # Whether the simulator is right is judged with each group as one pair.
+                # With a correlation that is too low, a right one would be refuted.
+                judged = regress(mean, once, precisions)
+            evidence = judged.log_evidence
+            average = evidence.logsumexp(dim=(1, 2)) - math.log(evidence[0].numel())
+            right = log_density_of_right(z - mean, noise, once)
+            prior = torch.logit(average.new_tensor(self.probability_of_none))
+            none = torch.sigmoid(right - average + prior)
+            return Conditional(found, noise, average, right, none, len(z))
+
         if possible and possible != (1,):
             with seeded(seed):
                 return impute(z, mean, conditional, counts)
         mean = mean.reshape(1, *z.shape)
         return conditional(mean, counts(mean)).posteriors()[0]
-
-    def _regressions(self, z: Tensor, *args: Any, **options: Any) -> Regressions:
-        precisions = z.new_tensor(self.gain_precisions)
-        grids = z.new_tensor(self.error_scales), z.new_tensor(self.degrees_of_freedom)
-        return Regressions.of(
-            z, *args, precisions, torch.cartesian_prod(*grids), **options
-        )
-
-    def _conditional(
-        self, mean: Tensor, weights: Tensor, *, z: Tensor, noise: Tensor, once: Tensor
-    ) -> Conditional:
-        """Return the posteriors given B sets of means, shape ``(B, n, l)``."""
-        regressions = judged = self._regressions(z, mean, weights, noise)
-        if once is not weights:
-            judged = self._regressions(z, mean, once, noise)
-        average = judged.log_evidence.flatten(1).logsumexp(dim=1)
-        average = average - math.log(judged.log_evidence[0].numel())
-        right = log_density_of_right(z - mean, noise, once)
-        prior = torch.logit(average.new_tensor(self.probability_of_none))
-        none = torch.sigmoid(right - average + prior)
-        return Conditional(regressions, noise, average, right, none, len(z))
-
-    def _correlations_within(
-        self, groups: Tensor, z: Tensor, mean: Tensor, noise: Tensor
-    ) -> Tensor:
-        """Return the mean correlation within groups, for each set of means."""
-        ratios = torch.tensor(VARIANCE_RATIOS).to(z)
-        correlations, ones = ratios / (1 + ratios), torch.ones(len(z)).to(z)
-        # Half of the precisions are enough to compare correlations.
-        model = replace(self, gain_precisions=self.gain_precisions[::2])
-        evidence = [
-            model._regressions(z, mean, ones, noise, groups=groups, correlation=one)
-            .log_evidence.flatten(1)
-            .logsumexp(dim=1)
-            for one in correlations.tolist()
-        ]
-        log_prior = torch.tensor(PRIOR_OF_RATIOS).to(z).log()
-        return (torch.stack(evidence, dim=1) + log_prior).softmax(dim=1) @ correlations
 
 
 def impute(
@@ -282,7 +270,7 @@ def _probabilities(
             seen[:, :, None],
             (flat @ to_seen.mT).unflatten(1, possible.shape[:2]),
             compute_mode="donot_use_mm_for_euclid_dist",
-        )[:, :, 0]
+        )
         for seen, to_seen in parts
     ]
-    return torch.softmax(-torch.cat(distances).square() / 2, dim=-1)
+    return torch.softmax(-torch.cat(distances)[:, :, 0].square() / 2, dim=-1)

@@ -237,10 +237,10 @@ class Regressions:
         z: Tensor,
         mean: Tensor,
         weights: Tensor,
-        noise: Tensor,
         precisions: Tensor,
-        settings: Tensor,
         *,
+        noise: Tensor,
+        settings: Tensor,
         groups: Tensor | None = None,
         correlation: float = 0.0,
     ) -> "Regressions":

@@ -248,5 +248,5 @@ def _outliers(residual: Tensor, noise: float) -> tuple[int, ...]:
     std = (distance.median() / 0.6745).clamp_min(noise)
     # The furthest of n values exceeds this quantile with a probability of 1 %. The
     # standard deviation is an estimate, hence Student's t.
-    furthest = t.isf(FALSE_ALARMS / (2 * n), EFFICIENCY * (n - 1))
-    return tuple((distance > furthest * std).nonzero()[:, 0].tolist())
+    furthest = float(t.isf(FALSE_ALARMS / (2 * n), EFFICIENCY * (n - 1)))
+    return tuple((distance > furthest * std).nonzero().flatten().tolist())
