@@ -10,8 +10,8 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from sbi_rope.discrepancy import Discrepancy, DiscrepancyModel
-from sbi_rope.discrepancy.regression import GroupErrors, Regressions, independent_pairs
+from sbi_rope.discrepancy import DiscrepancyModel
+from sbi_rope.discrepancy.posterior import Regressions, independent_pairs
 
 # Settings of the hyper-parameters k, s and the strength of the error's prior.
 SETTINGS = [(0.5, 0.2, 1.0), (3.0, 0.6, 4.0), (30.0, 0.1, 20.0)]
@@ -190,12 +190,17 @@ def test_the_evidence_of_correlated_errors_is_a_matrix_t_density(
             + torch.special.multigammaln(torch.tensor((degrees + n) / 2), width)
             - torch.special.multigammaln(torch.tensor(degrees / 2), width)
         )
-        errors = GroupErrors(groups=groups, correlation=rho)
-        ones = torch.ones(n).double()
-        noise = no_noise(width).double()
-        regression = Regressions.of(z, mean[None], [k], ones, noise, errors=errors)
-        found = regression.log_evidence([(s, strength)])
-        assert float(found) == pytest.approx(float(expected), abs=1e-4)
+        found = Regressions.of(
+            z,
+            mean[None],
+            torch.ones(n).double(),
+            torch.tensor([k]).double(),
+            noise=no_noise(width).double(),
+            settings=torch.tensor([[s, strength]]).double(),
+            groups=groups,
+            correlation=rho,
+        )
+        assert float(found.log_evidence) == pytest.approx(float(expected), abs=1e-4)
 
 
 def std_of_offset(z: Tensor, mean: Tensor, **options: Tensor) -> float:
@@ -226,22 +231,23 @@ def test_sets_of_means_have_each_the_posterior_that_they_have_alone() -> None:
     weights = independent_pairs(groups, correlations, torch.rand(9) + 0.5)
     assert weights.shape == (4, 9)
 
-    model = DiscrepancyModel(gain_precisions=(0.1, 1.0), error_scales=(0.1, 0.4))
-    noise, once = 0.1 * torch.eye(2).double(), torch.rand(9).double()
+    def regressions(some: slice) -> Regressions:
+        return Regressions.of(
+            z,
+            means[some],
+            weights[some],
+            torch.tensor([0.1, 1.0]).double(),
+            noise=0.1 * torch.eye(2).double(),
+            settings=torch.tensor([[0.1, 1.0], [0.4, 3.0]]).double(),
+        )
 
-    def posteriors(some: slice) -> list[Discrepancy]:
-        given = {"z": z, "noise": noise, "once": once}
-        return model._conditional(means[some], weights[some], **given).posteriors()
-
-    for number, one in enumerate(posteriors(slice(None))):
-        [alone] = posteriors(slice(number, number + 1))
-        assert torch.allclose(one.shares, alone.shares)
-        assert one.num_independent == pytest.approx(float(weights[number].sum()))
-        for name in ("probability_of_none", "log_evidence", "log_evidence_of_none"):
-            assert getattr(one, name) == pytest.approx(getattr(alone, name))
-        for term, other in zip(one.terms, alone.terms, strict=True):
-            for name, part in vars(term).items():  # signs of eigenvectors may differ
-                assert torch.allclose(part.abs(), getattr(other, name).abs())
+    together = regressions(slice(None))
+    for b in range(4):
+        alone = regressions(slice(b, b + 1))
+        assert torch.allclose(alone.log_evidence[0], together.log_evidence[b])
+        expected, found = alone.at(0, 1, 1), together.at(b, 1, 1)
+        for name, part in vars(found).items():  # signs of eigenvectors may differ
+            assert torch.allclose(part.abs(), getattr(expected, name).abs())
 
 
 def test_many_recordings_that_are_hardly_correlated_count_as_many_pairs() -> None:

@@ -63,6 +63,6 @@ def test_bars_that_are_asked_for_are_shown_without_a_terminal_and_on_stderr(
     bars = (
         "Fine-tuning",
         "Sampling",
-        "Training NPE: 3 epochs",
+        "Training neural network. Epochs trained: 3",
     )
     assert [bar for bar in bars if bar not in printed.err] == []
