@@ -12,8 +12,8 @@ from torch import Tensor
 
 from sbi_rope.data.pairs import groups_of
 from sbi_rope.discrepancy.posterior import (
-    Conditional,
     Discrepancy,
+    Judged,
     Regressions,
     independent_pairs,
     log_density_of_right,
@@ -158,7 +158,7 @@ class DiscrepancyModel(Settings):
         regress = partial(Regressions.of, z, noise=noise, settings=settings)
 
         def counts(mean: Tensor) -> Tensor:
-            """Return how many independent pairs each counts as, given B sets."""
+            """Return how many independent pairs each counts as, for B sets of means."""
             if groups is None:
                 return weights
             ratios, ones = torch.tensor(VARIANCE_RATIOS).to(z), torch.ones_like(weights)
@@ -174,31 +174,30 @@ class DiscrepancyModel(Settings):
             shares = (torch.stack(evidence, dim=1) + log_prior).softmax(dim=1)
             return independent_pairs(groups, shares @ correlations, weights)
 
-        def conditional(mean: Tensor, weights: Tensor) -> Conditional:
-            """Return the posteriors given B sets of means, shape ``(B, n, l)``."""
+        def posterior(mean: Tensor, weights: Tensor) -> tuple[Regressions, Judged]:
             found = judged = regress(mean, weights, precisions)
             if groups is not None:
                 # Whether the simulator is right is judged with each group as one pair.
                 # With a correlation that is too low, a right one would be refuted.
                 judged = regress(mean, once, precisions)
             evidence = judged.log_evidence
-            average = evidence.logsumexp(dim=(1, 2)) - math.log(evidence[0].numel())
+            off = evidence.logsumexp(dim=(1, 2)) - math.log(evidence[0].numel())
             right = log_density_of_right(z - mean, noise, once)
-            prior = torch.logit(average.new_tensor(self.probability_of_none))
-            none = torch.sigmoid(right - average + prior)
-            return Conditional(found, noise, average, right, none, len(z))
+            prior = torch.logit(off.new_tensor(self.probability_of_none))
+            return found, Judged(off, right, torch.sigmoid(right - off + prior))
 
         if possible and possible != (1,):
             with seeded(seed):
-                return impute(z, mean, conditional, counts)
+                return impute(z, mean, posterior, counts)
         mean = mean.reshape(1, *z.shape)
-        return conditional(mean, counts(mean)).posteriors()[0]
+        found, judged = posterior(mean, counts(mean))
+        return found.posteriors(judged)[0]
 
 
 def impute(
     z: Tensor,
     possible: Tensor,
-    conditional: Callable[[Tensor, Tensor], Conditional],
+    posterior: Callable[[Tensor, Tensor], tuple[Regressions, Judged]],
     counts: Callable[[Tensor], Tensor],
 ) -> Discrepancy:
     r"""Average the posterior over imputed means, by Gibbs sampling in C chains.
@@ -210,10 +209,10 @@ def impute(
     """
     mean = possible.mean(dim=1).expand(NUM_CHAINS, -1, -1)
     weights = counts(mean)
-    given = conditional(mean, weights)
+    found, judged = posterior(mean, weights)
     kept: list[Discrepancy] = []
     for number in range(1, NUM_WARM_UP + NUM_KEPT * APART + 1):
-        probabilities = _probabilities(z, possible, *given.draw())
+        probabilities = _probabilities(z, possible, *found.draw(judged))
         # Faster than torch.multinomial, which draws a number for each of the means.
         bounds = probabilities.cumsum(dim=-1)
         drawn = torch.rand(bounds.shape[:-1]).to(bounds) * bounds[..., -1]
@@ -221,9 +220,9 @@ def impute(
         mean = possible[torch.arange(len(z)), chosen.clamp_max(possible.shape[1] - 1)]
         if number == NUM_WARM_UP:
             weights = counts(mean)
-        given = conditional(mean, weights)
+        found, judged = posterior(mean, weights)
         if number > NUM_WARM_UP and (number - NUM_WARM_UP) % APART == 0:
-            kept.extend(given.posteriors())
+            kept.extend(found.posteriors(judged))
     # They are not zero, even if the simulator is right in all of them.
     off = [max(1 - one.probability_of_none, 1e-290) for one in kept]
     shares = torch.cat([p * one.shares for p, one in zip(off, kept, strict=True)])

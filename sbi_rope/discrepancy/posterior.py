@@ -84,9 +84,8 @@ class Discrepancy:
         log_evidence: Log density of the pairs under a discrepancy, where each group
             counts as one pair.
         log_evidence_of_none: The same if the simulator is right.
-        num_pairs: The number of calibration pairs.
-        num_independent: How many independent pairs these count as: the sum of their
-            weights, or less if pairs of a group have errors in common.
+        num_independent: How many independent pairs the calibration pairs count as: the
+            sum of their weights, or less if pairs of a group have errors in common.
     """
 
     terms: tuple[Term, ...] = field(repr=False)
@@ -95,7 +94,6 @@ class Discrepancy:
     probability_of_none: float
     log_evidence: float
     log_evidence_of_none: float
-    num_pairs: int
     num_independent: float
 
     @torch.no_grad()
@@ -211,6 +209,14 @@ def independent_pairs(
     return w / (1 + (number[groups] - 1) * correlation)
 
 
+class Judged(NamedTuple):
+    """Whether the simulator is right, given each of B sets of means, ``(B,)``."""
+
+    off: Tensor  # the log density of the pairs under a discrepancy
+    right: Tensor  # that if the simulator is right
+    probability_of_none: Tensor
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Regressions:
     """Real observations regressed on B sets of simulated means, for all priors.
@@ -228,6 +234,7 @@ class Regressions:
     variances: Tensor
     directions: Tensor
     num_pairs: Tensor  # the sum of the weights of the pairs, (B,)
+    noise: Tensor  # C, the covariance of simulations at one parameter, (l, l)
     settings: Tensor  # (S, 2)
     log_evidence: Tensor  # the log density of the pairs, (B, K, S)
 
@@ -297,6 +304,7 @@ class Regressions:
             variances=variances,
             directions=directions,
             num_pairs=num_pairs,
+            noise=noise,
             settings=settings,
             log_evidence=-n * width / 2 * math.log(math.pi)
             + log_volume[..., None]
@@ -318,48 +326,31 @@ class Regressions:
             degrees=strength + scale.shape[-1] + 1 + self.num_pairs[b],
         )
 
-
-@dataclass(frozen=True, eq=False)
-class Conditional:
-    """The posterior of the discrepancy given each of B sets of means."""
-
-    regressions: Regressions
-    noise: Tensor  # C, the covariance of simulations at one parameter, (l, l)
-    # Log densities of the pairs under a discrepancy and if the simulator is right, with
-    # each group as one pair, and the probability that it is right, (B,).
-    average: Tensor
-    right: Tensor
-    probability_of_none: Tensor
-    num_pairs: int
-
-    def posteriors(self) -> list[Discrepancy]:
-        """Return the averages over the settings whose evidence is not negligible."""
+    def posteriors(self, judged: Judged) -> list[Discrepancy]:
+        """Return for each set the average over settings with evidence for them."""
         found = []
-        for b, evidence in enumerate(self.regressions.log_evidence):
+        for b, evidence in enumerate(self.log_evidence):
             kept = evidence > evidence.max() + math.log(NEGLIGIBLE)
-            settings = kept.nonzero().tolist()
             one = Discrepancy(
-                terms=tuple(self.regressions.at(b, k, s) for k, s in settings),
+                terms=tuple(self.at(b, k, s) for k, s in kept.nonzero().tolist()),
                 shares=torch.softmax(evidence[kept], dim=0),
                 noise=self.noise,
-                probability_of_none=float(self.probability_of_none[b]),
-                log_evidence=float(self.average[b]),
-                log_evidence_of_none=float(self.right[b]),
-                num_pairs=self.num_pairs,
-                num_independent=float(self.regressions.num_pairs[b]),
+                probability_of_none=float(judged.probability_of_none[b]),
+                log_evidence=float(judged.off[b]),
+                log_evidence_of_none=float(judged.right[b]),
+                num_independent=float(self.num_pairs[b]),
             )
             found.append(one)
         return found
 
-    def draw(self) -> tuple[Tensor, Tensor, Tensor]:
+    def draw(self, judged: Judged) -> tuple[Tensor, Tensor, Tensor]:
         """Draw a gain, an offset and the covariance of z given theta for each set."""
-        evidence = self.regressions.log_evidence
-        chosen = torch.multinomial(evidence.flatten(1).softmax(dim=1), 1)[:, 0]
-        b = torch.arange(len(chosen), device=chosen.device)
-        k, s = chosen // evidence.shape[2], chosen % evidence.shape[2]
-        drawn = self.regressions.at(b, k, s).sample(1)
+        probabilities = self.log_evidence.flatten(1).softmax(dim=1)
+        chosen = torch.multinomial(probabilities, 1)[:, 0]
+        b, count = torch.arange(len(chosen), device=chosen.device), len(self.settings)
+        drawn = self.at(b, chosen // count, chosen % count).sample(1)
         gain, offset, covariance = (values[0] for values in drawn)
-        none = torch.rand(len(chosen)).to(gain) < self.probability_of_none
+        none = torch.rand(len(chosen)).to(gain) < judged.probability_of_none
         none, identity = none[:, None, None], torch.eye(len(self.noise)).to(gain)
         return (
             torch.where(none, identity, gain),

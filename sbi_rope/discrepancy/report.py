@@ -62,7 +62,6 @@ class SummaryDiscrepancy:
         outliers: Rows of calibration pairs that do not fit the others. In 99 of 100
             summaries without outliers no pair is so far away by chance.
         std: The standard deviation of simulations from the prior, in the units of x.
-        num_independent: How many independent pairs the calibration pairs count as here.
     """
 
     name: str
@@ -72,7 +71,6 @@ class SummaryDiscrepancy:
     size: Interval
     probability_of_none: float
     std: float
-    num_independent: float
     outliers: tuple[int, ...] = ()
 
     @property
@@ -120,17 +118,10 @@ class DiscrepancyReport:
 
     @property
     def notes(self) -> list[str]:
-        """Sentences about constant summaries, groups of pairs, and outliers."""
+        """Sentences about constant summaries and outliers."""
         notes = []
         if self.constant:
             notes.append(f"The same in all simulations: {', '.join(self.constant)}.")
-        if self.num_groups < self.num_pairs:
-            numbers = [round(summary.num_independent) for summary in self.summaries]
-            count = " to ".join(map(str, sorted({min(numbers), max(numbers)})))
-            notes.append(
-                "Pairs of a group can have errors in common. Here, the "
-                f"{self.num_pairs} pairs count as {count} independent ones."
-            )
         outliers = sorted((row, s.name) for s in self.summaries for row in s.outliers)
         if outliers:
             listed = ", ".join(f"row {row} ({name})" for row, name in outliers)
@@ -150,19 +141,16 @@ class DiscrepancyReport:
             f"What {self.num_pairs} calibration pairs{in_groups} say about the "
             "simulator",
             "  observed = mean + shift + gain (simulated - mean) + error",
+            "  95 % intervals; size in standard deviations of simulations, shift and "
+            "error in units of x",
         ]
         if off:
-            lines.append(
-                "  95 % intervals; size in standard deviations of simulations, shift "
-                "and error in units of x"
-            )
-            heads = ("name", "size", "shift", "gain", "error")
-            rows = [[str(getattr(one, head)) for head in heads] for one in off]
-            rows.insert(0, ["summary", *heads[1:]])
+            names = ("name", "size", "shift", "gain", "error")
+            rows = [[str(getattr(one, name)) for name in names] for one in off]
+            rows.insert(0, ["summary", *names[1:]])
             widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-            lines += [
-                "  " + "  ".join(map(str.ljust, row, widths)).rstrip() for row in rows
-            ]
+            cells = (map(str.ljust, row, widths) for row in rows)
+            lines += ["  " + "  ".join(row).rstrip() for row in cells]
         if fine:
             lines.append(f"  no sign of discrepancy: {', '.join(fine)}")
         return "\n".join([*lines, *(f"  {note}" for note in self.notes)])
@@ -221,10 +209,19 @@ def _summary(
     error = draws.error_factor[:, 0, 0].abs()
     size = ((gain - 1).square() + shift.square() + error.square()).sqrt()
     outliers: tuple[int, ...] = ()
-    if mean.shape[1] == 1:  # otherwise a residual may come from the label
+    n, num_means = mean.shape[:2]
+    # Of several means, a residual may come from the label.
+    if num_means == 1 and n >= MIN_PAIRS_FOR_OUTLIERS:
         residual = (z - gain.median() * mean[:, 0] - shift.median())[:, 0]
+        distance = (residual - residual.median()).abs()
         noise = float(gain.median().abs() * discrepancy.noise[0, 0].sqrt())
-        outliers = _outliers(residual, noise)
+        # The median distance of a normal variable from its median is 0.6745 standard
+        # deviations.
+        std = (distance.median() / 0.6745).clamp_min(noise)
+        # The furthest of n values exceeds this quantile with a probability of 1 %. The
+        # standard deviation is an estimate, hence Student's t.
+        furthest = float(t.isf(FALSE_ALARMS / (2 * n), EFFICIENCY * (n - 1)))
+        outliers = tuple((distance > furthest * std).nonzero().flatten().tolist())
     return SummaryDiscrepancy(
         name=name,
         gain=Interval.of(gain),
@@ -234,19 +231,4 @@ def _summary(
         probability_of_none=discrepancy.probability_of_none,
         outliers=outliers,
         std=scale,
-        num_independent=discrepancy.num_independent,
     )
-
-
-def _outliers(residual: Tensor, noise: float) -> tuple[int, ...]:
-    """Return the rows of outliers; their standard deviation is at least ``noise``."""
-    if (n := len(residual)) < MIN_PAIRS_FOR_OUTLIERS:
-        return ()
-    distance = (residual - residual.median()).abs()
-    # The median distance of a normal variable from its median is 0.6745 standard
-    # deviations.
-    std = (distance.median() / 0.6745).clamp_min(noise)
-    # The furthest of n values exceeds this quantile with a probability of 1 %. The
-    # standard deviation is an estimate, hence Student's t.
-    furthest = float(t.isf(FALSE_ALARMS / (2 * n), EFFICIENCY * (n - 1)))
-    return tuple((distance > furthest * std).nonzero().flatten().tolist())

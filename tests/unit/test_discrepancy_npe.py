@@ -90,7 +90,7 @@ def test_every_source_of_simulations_gives_a_posterior_of_sbi(space: str) -> Non
         found = log_probs(posterior, x)
         assert found.isfinite().all(), name
         assert len(made.history.training_loss) >= 4, name
-        assert made.discrepancy.num_pairs == 12, name
+        assert made.discrepancy.num_independent == 12, name
         assert not torch.equal(found, log_probs(problems.npe_posterior(), x)), name
     with pytest.raises(NotReadyError, match=r"Call `train\(\)` first"):
         _ = made.append_calibration(*labelled()).discrepancy
