@@ -119,16 +119,15 @@ class Discrepancy:
             *counts, num_none = chosen.bincount(minlength=len(shares)).tolist()
             of_terms = zip(self.terms, counts, strict=True)
             parts = [term.sample(count) for term, count in of_terms if count]
+            parts = parts or [self.terms[0].sample(0)]
+        gain, offset, covariance = map(torch.cat, zip(*parts, strict=True))
+        error = covariance - gain @ self.noise @ gain.mT
+        variance, directions = torch.linalg.eigh(error / scale / scale[:, None])
+        std = variance.clamp_min(smallest_error**2).sqrt()
+        factor = scale[:, None] * directions * std[:, None, :]
         no_error = self.noise.new_zeros(num_none, *self.noise.shape)
         same = no_error + torch.eye(len(scale)).to(no_error)
-        draws = [DiscrepancyDraws(same, no_error[:, 0], no_error)]
-        if parts:
-            gain, offset, covariance = map(torch.cat, zip(*parts, strict=True))
-            error = covariance - gain @ self.noise @ gain.mT
-            variance, directions = torch.linalg.eigh(error / scale / scale[:, None])
-            std = variance.clamp_min(smallest_error**2).sqrt()
-            factor = scale[:, None] * directions * std[:, None, :]
-            draws.insert(0, DiscrepancyDraws(gain, offset, factor))
+        draws = (gain, offset, factor), (same, no_error[:, 0], no_error)
         return DiscrepancyDraws.joined(draws)
 
 
@@ -146,7 +145,7 @@ class DiscrepancyDraws(NamedTuple):
     error_factor: Tensor
 
     @classmethod
-    def joined(cls, parts: "Iterable[DiscrepancyDraws]") -> "DiscrepancyDraws":
+    def joined(cls, parts: Iterable[tuple[Tensor, ...]]) -> "DiscrepancyDraws":
         """Return all draws of several sets, one set after the other."""
         return cls(*map(torch.cat, zip(*parts, strict=True)))
 

@@ -134,22 +134,6 @@ def test_correcting_an_embedding_leaves_its_net_and_correcting_x_does_not() -> N
         assert torch.equal(*embedded) is same, space
 
 
-@pytest.mark.slow
-def test_learned_parameters_move_the_posterior_to_those_of_the_pairs() -> None:
-    theta = problems.box(2).sample((2000,))
-    theta = theta[theta[:, 0] > 0.5][:100]
-    x = problems.simulate(theta) + 3 * torch.randn(100, 3)  # hardly informative
-    means = []
-    for learn_prior in (False, True):
-        options = {"num_steps": 1000, "num_simulations": 2000}
-        made = method(learn_prior=learn_prior, **options)
-        posterior = made.append_calibration(theta, x).train(**QUIET).build_posterior()
-        samples = posterior.sample_batched((50,), x[:20], show_progress_bars=False)
-        means.append(float(samples[..., 0].mean()))
-    assert means[0] < 0.3
-    assert 0.6 < means[1] < 0.9
-
-
 @pytest.mark.parametrize("space", ["embedding", "input"])
 def test_entries_that_are_constant_in_simulations_do_not_change_the_posterior(
     space: Any,

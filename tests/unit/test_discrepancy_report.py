@@ -11,7 +11,6 @@ from sbi_rope.data.simulate import Moments
 from sbi_rope.discrepancy import DiscrepancyModel, DiscrepancyReport, Interval
 from sbi_rope.discrepancy.report import report_discrepancy
 from sbi_rope.methods import DiscrepancyNPE
-from sbi_rope.tasks import get_task
 from sbi_rope.utils.errors import InvalidInputError, NotReadyError
 from tests import problems
 
@@ -224,17 +223,3 @@ def test_the_discrepancy_of_an_image_is_that_of_its_summaries() -> None:
         assert inside(0.5, found["NE"].shift)
         arrays = asked.report(summaries=lambda x: blocks(x).numpy(), x_names=names)
         assert arrays == found
-
-
-@pytest.mark.medium
-def test_the_published_law_of_the_light_tunnel_over_predicts_all_light(
-    chamber_root: Any,
-) -> None:
-    task = get_task("light_tunnel_sensors", root=chamber_root)
-    asked = DiscrepancyNPE(task.get_prior(), simulator=task.get_simulator())
-    asked.append_calibration(*task.get_calibration_set(20))
-    found = asked.report(x_names=task.x_names, show_progress_bars=False)
-    off = {summary.name for summary in found.summaries if summary.is_off}
-    assert off == {f"log_{kind}_{i}" for kind in ("ir", "vis") for i in (1, 2, 3)}
-    assert all(found[name].shift.high < 0 for name in off)  # in log units
-    assert "no sign of discrepancy: current" in str(found)
