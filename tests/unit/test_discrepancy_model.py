@@ -196,6 +196,32 @@ def test_a_group_counts_as_many_pairs_as_its_errors_are_independent() -> None:
     assert once == pytest.approx(alone, rel=0.15)
 
 
+def test_sets_of_means_have_each_the_posterior_that_they_have_alone() -> None:
+    z, mean = pairs(9, 2)
+    means = mean + 0.3 * torch.randn(4, 9, 2)
+    groups, correlations = torch.arange(9) // 3, torch.tensor([0.0, 0.2, 0.5, 0.9])
+    weights = independent_pairs(groups, correlations, torch.rand(9) + 0.5)
+    assert weights.shape == (4, 9)
+
+    def regressions(some: slice) -> Regressions:
+        return Regressions.of(
+            z,
+            means[some],
+            weights[some],
+            torch.tensor([0.1, 1.0]).double(),
+            noise=0.1 * torch.eye(2).double(),
+            settings=torch.tensor([[0.1, 1.0], [0.4, 3.0]]).double(),
+        )
+
+    together = regressions(slice(None))
+    for b in range(4):
+        alone = regressions(slice(b, b + 1))
+        assert torch.allclose(alone.log_evidence[0], together.log_evidence[b])
+        expected, found = alone.at(0, 1, 1), together.at(b, 1, 1)
+        for name, part in vars(found).items():  # signs of eigenvectors may differ
+            assert torch.allclose(part.abs(), getattr(expected, name).abs())
+
+
 def test_weights_that_differ_within_a_group_count_by_their_effective_number() -> None:
     # The variance of their mean is that of correlated errors, summed by hand.
     groups, weights, rho = torch.tensor([0, 0, 1]), torch.tensor([2.0, 1.0, 3.0]), 0.5
