@@ -11,11 +11,8 @@ from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.posterior import Discrepancy
 from sbi_rope.npe.standardisation import Standardisation
 from sbi_rope.utils.errors import InvalidInputError
-from sbi_rope.utils.progress import progress_bar
 
 NUM_DRAWS = 4000
-# A progress bar appears after this many seconds.
-DELAY = 2.0
 # The probability that a summary without outliers is reported to have one.
 FALSE_ALARMS = 0.01
 # The efficiency of a standard deviation that is estimated from a median distance.
@@ -164,7 +161,6 @@ def report_discrepancy(
     model: DiscrepancyModel,
     weights: Tensor | None = None,
     groups: Tensor | None = None,
-    show_progress_bars: bool = False,
 ) -> DiscrepancyReport:
     """Fit the discrepancy of each summary of x ``(n, l)`` separately.
 
@@ -178,9 +174,7 @@ def report_discrepancy(
             "Expected simulations that differ from each other; all summaries are "
             "constant."
         )
-    for j in progress_bar(
-        varying, show=show_progress_bars, desc="Summaries", delay=DELAY
-    ):
+    for j in varying:
         mean, std = unit.mean[j], unit.std[j]
         z = ((x[:, j].double() - mean) / std)[:, None]
         m = ((moments.means[..., j] - mean) / std)[..., None]

@@ -337,15 +337,13 @@ class Method(ABC):
         read = as_batch("theta", theta, shape, names=self._theta_names)
         return read.to(self._device, torch.float32, copy=True)
 
-    def _check_data(self, kinds: tuple[Kind, ...] = KINDS) -> None:
-        """Raise unless there are the data of some kinds that the method needs."""
-        for kind in kinds:
-            is_needed = kind in self.sees and (
-                kind != "simulations" or self.needs_simulations
-            )
+    def _check_data(self, *kinds: Kind) -> None:
+        """Raise unless there are the data of these kinds, or of all, that it needs."""
+        for kind in kinds or KINDS:
+            is_needed = self.needs_simulations if kind == "simulations" else True
             least = self.min_pairs if kind == "calibration" else 1
             count = len(self._data.tensors.get(kind, [()])[0])
-            if is_needed and count < least:
+            if is_needed and kind in self.sees and count < least:
                 raise NotReadyError(
                     f"{type(self).__name__} needs at least {least} rows of "
                     f"`append_{kind}(...)`; got {count}."

@@ -122,8 +122,9 @@ class DiscrepancyNPE(Method):
         Returns:
             The gain, shift and error of each summary with 95 % intervals.
         """
-        needed = ("calibration", "simulations")[: 1 if self._simulator else 2]
-        self._check_data(needed)
+        self._check_data("calibration")
+        if self._simulator is None:
+            self._check_data("simulations")
         pairs, show = self._data.pairs, is_shown(show_progress_bars)
         if pairs.x.ndim != 2 and summaries is None:
             raise InvalidInputError(
@@ -148,7 +149,6 @@ class DiscrepancyNPE(Method):
                 as_batch("summaries of simulations", summarised(x_s)),
                 model=self.model,
                 groups=pairs.group,
-                show_progress_bars=show,
             )
         return report if x_names is None else report.renamed(x_names)
 
