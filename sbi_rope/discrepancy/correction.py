@@ -191,8 +191,8 @@ def surprise(
     w = torch.ones_like(found) if weights is None else weights.to(found)
     numbers = groups_of(torch.arange(len(z)) if groups is None else groups)
     shared = w / numbers.bincount()[numbers].to(w)
-    excess, w = group_means(excess, shared, numbers)
-    variance, _ = group_means(variance, shared, numbers)
+    values, w = group_means(torch.stack([excess, variance], 1), shared, numbers)
+    excess, variance = values.T
     return float((w * excess).sum() / (w.square() * variance).sum().sqrt())
 
 
