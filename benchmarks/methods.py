@@ -28,8 +28,11 @@ from sbi_rope.baselines import (
     Training,
     TuningOnly,
 )
-from sbi_rope.discrepancy.correction import Space
+from sbi_rope.density import MixturePosterior
 from sbi_rope.methods import DiscrepancyNPE
+from sbi_rope.methods.discrepancy_npe import Corrected
+from sbi_rope.rope import RoPE
+from sbi_rope.stacking import DiscrepancyCandidate, StackData
 from sbi_rope.training.fit import History
 
 # Tasks whose observations are statistics: NNPE's noise is on them, not on h(x).
@@ -103,7 +106,7 @@ def _published_noise(case: Case) -> float:
     return 0.5 if case.task.name == "wind_tunnel" else 0.05
 
 
-def _short_space(case: Case, most: int) -> Space:
+def _short_space(case: Case, most: int) -> Corrected:
     return "input" if math.prod(case.task.x_shape) <= most else "embedding"
 
 
@@ -126,8 +129,24 @@ class _ThenFinetuned(DiscrepancyNPE):
         return method.build_posterior(), method.history
 
 
+class _Tuned(DiscrepancyNPE):
+    """The discrepancy behind tuned nets that is a candidate of stacks, alone."""
+
+    def _fit(self, *, show_progress_bars: bool) -> tuple[Any, None]:
+        simulations = self._looked_up
+        rope = RoPE(self._given_npe, simulator=self._simulator, simulations=simulations)
+        rope.append_calibration(*self._data.calibration)
+        [seed] = torch.randint(2**31, (1,)).tolist()
+        data = StackData(
+            rope, num_folds=5, seed=seed, show_progress_bars=show_progress_bars
+        )
+        candidate = DiscrepancyCandidate(space="tuned", learn_prior=self.learn_prior)
+        [density] = candidate.fit(data, [data.every])
+        return MixturePosterior(density, self._prior), None
+
+
 def _discrepancy(
-    space: Space | None = None,
+    space: Corrected | None = None,
     *,
     kind: type[DiscrepancyNPE] = DiscrepancyNPE,
     learn_prior: bool = False,
@@ -259,7 +278,7 @@ METHODS: dict[str, Entry] = {
         style=("#882255", "-.", "h"),
         pairs=True,
         ours=True,
-        build=_discrepancy("tuned"),
+        build=_discrepancy("embedding", kind=_Tuned),
     ),
     "discrepancy, prior learned": Entry(
         style=("#882255", ":", "h"),

@@ -102,9 +102,6 @@ METHODS: dict[str, Entry] = {
     "discrepancy_input": Entry(
         DiscrepancyNPE, lambda task: {**CORRECTION, "space": "input"}
     ),
-    "discrepancy_tuned": Entry(
-        DiscrepancyNPE, lambda task: {**CORRECTION, "space": "tuned"}
-    ),
     "fmcpe": Entry(FMCPE, lambda task: BRIEF),
     "frisbi": Entry(FRISBI, lambda task: BRIEF),
     "frisbi_distilled": Entry(FRISBI, lambda task: {**BRIEF, "distilled": True}),

@@ -7,7 +7,11 @@ from torch import Tensor
 from sbi_rope.baselines.error_model import SpikeAndSlab
 from sbi_rope.baselines.statistics import NoiseOn, clipped_statistics
 from sbi_rope.methods.base import Method
-from sbi_rope.methods.training import EstimatorBuilder, train_on_simulations
+from sbi_rope.methods.training import (
+    EstimatorBuilder,
+    SimulationTrainer,
+    train_on_simulations,
+)
 from sbi_rope.npe.sbi import embed, posterior_from
 from sbi_rope.training.fit import History, Training
 from sbi_rope.utils.settings import check
@@ -69,8 +73,13 @@ class NNPE(Method):
         theta, x = self._data.simulations
         net, clip, density, estimator = clipped_statistics(npe, self.noise_on, x)
 
-        def with_noise(statistics: Tensor) -> Tensor:
-            return statistics + clip.std * self.error_model.sample_like(statistics)
+        error_model = self.error_model
+
+        class Trainer(SimulationTrainer):
+            def _loss(self, theta: Tensor, x: Tensor, *args: Any, **kw: Any) -> Tensor:
+                # The noise is drawn anew in every batch.
+                noise = clip.std * error_model.sample_like(x)
+                return super()._loss(theta, x + noise, *args, **kw)
 
         trained, history = train_on_simulations(
             self._prior,
@@ -80,7 +89,7 @@ class NNPE(Method):
             embed(net, x),
             training=self.training,
             show_progress_bars=show_progress_bars,
-            change_x=with_noise,  # anew in every batch
+            trainer=Trainer,
         )
         # It shares its parameters with the estimator, on whatever device.
         density.load_state_dict(trained.state_dict())

@@ -93,8 +93,8 @@ class ReferenceNPE(PlainNPE):
         Returns:
             Parameters and simulations, without those that are not finite.
         """
-        theta = self._data.read_theta(theta)
-        like = theta.new_empty(0, *self._data.event_shape or ())
+        theta = self._read_theta(theta)
+        like = theta.new_empty(0, *self._event_shape or ())
         with seeded(seed):
             x, _ = Simulated(simulator, self._prior, like=like).simulate(theta)
         valid = torch.isfinite(x).flatten(1).all(dim=1)

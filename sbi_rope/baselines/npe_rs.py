@@ -6,7 +6,11 @@ import torch
 from torch import Tensor
 
 from sbi_rope.methods.base import Method
-from sbi_rope.methods.training import EstimatorBuilder, train_on_simulations
+from sbi_rope.methods.training import (
+    EstimatorBuilder,
+    SimulationTrainer,
+    train_on_simulations,
+)
 from sbi_rope.npe.sbi import direct_posterior, embedding_of
 from sbi_rope.training.fit import History, Training
 from sbi_rope.utils.errors import warn_user
@@ -102,6 +106,14 @@ class NPERS(Method):
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         theta, x = self._data.simulations
+        penalty = self._penalty
+
+        class Trainer(SimulationTrainer):
+            def _loss(self, *args: Any, **kwargs: Any) -> Tensor:
+                net: Any = self._neural_net
+                added = penalty(net, x) if net.training else 0.0
+                return super()._loss(*args, **kwargs) + added
+
         estimator, history = train_on_simulations(
             self._prior,
             self._build,
@@ -109,7 +121,7 @@ class NPERS(Method):
             x,
             training=self.training,
             show_progress_bars=show_progress_bars,
-            penalty=lambda estimator: self._penalty(estimator, x),
+            trainer=Trainer,
         )
         if self.regularisation and not _has_trainable_embedding(estimator):
             warn_user(
@@ -119,10 +131,10 @@ class NPERS(Method):
             )
         return direct_posterior(estimator, self._prior), history
 
-    def _penalty(self, estimator: Any, x: Tensor) -> Tensor | None:
-        r"""Return :math:`\beta \mathrm{MMD}^2`; None if nothing depends on it."""
+    def _penalty(self, estimator: Any, x: Tensor) -> Tensor | float:
+        r"""Return :math:`\beta \mathrm{MMD}^2`; zero if nothing depends on it."""
         if not self.regularisation or not _has_trainable_embedding(estimator):
-            return None
+            return 0.0
         embedding = embedding_of(estimator)
         simulations, observations = (
             rows[torch.randperm(len(rows))[:NUM_ROWS]]

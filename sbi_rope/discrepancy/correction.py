@@ -174,26 +174,25 @@ def surprise(
     .. math:: \frac{\sum_i w_i (T_i - E_i)}{\sqrt{\sum_i w_i^2 V_i}}, \qquad
         T_i = (z_i - m_i)^\top C^{-1} (z_i - m_i)
 
-    If :math:`z_i` were a simulation with the covariance :math:`C_i`, then :math:`T_i`
-    would have the mean :math:`E_i = \operatorname{tr}(C^{-1} C_i)` and, if it were
-    Gaussian, the variance :math:`V_i = 2 \operatorname{tr}((C^{-1} C_i)^2)`. Here C is
-    the mean of all :math:`C_i`. In the worst case, pairs of a group have everything in
-    common, so that each group counts as one pair, with the means of its T, E and V. Of
-    several possible means, ``(n, R, l)``, the nearest counts.
+    If :math:`z_i` were a Gaussian simulation with the covariance :math:`C_i`, then
+    :math:`T_i` would have the mean :math:`E_i = \operatorname{tr}(C^{-1} C_i)` and the
+    variance :math:`V_i = 2 \operatorname{tr}((C^{-1} C_i)^2)`. C is the mean of all
+    :math:`C_i`. Each group counts as one pair, with the means of its T, E and V: in the
+    worst case its pairs have everything in common. Of several possible means,
+    ``(n, R, l)``, the nearest counts.
     """
     covariances = covariances + rounding(covariances.mean(dim=0)).diag()
+    inverse = torch.linalg.inv(covariances.mean(dim=0))
     residual = z.to(covariances)[:, None] - means
-    factor = torch.linalg.cholesky(covariances.mean(dim=0))
-    white = torch.linalg.solve_triangular(factor, residual.mT, upper=False)
-    found = white.square().sum(dim=1).amin(dim=1)
-    relative = torch.cholesky_inverse(factor) @ covariances
-    expected = relative.diagonal(dim1=1, dim2=2).sum(dim=1)
+    found = (residual @ inverse * residual).sum(dim=2).amin(dim=1)
+    relative = inverse @ covariances
+    excess = found - relative.diagonal(dim1=1, dim2=2).sum(dim=1)
     variance = 2 * (relative * relative.mT).sum(dim=(1, 2))
     w = torch.ones_like(found) if weights is None else weights.to(found)
     numbers = groups_of(torch.arange(len(z)) if groups is None else groups)
     shared = w / numbers.bincount()[numbers].to(w)
-    excess, w = group_means(found - expected, shared, numbers)
-    variance, _ = group_means(variance, shared, numbers)
+    values, w = group_means(torch.stack([excess, variance], 1), shared, numbers)
+    excess, variance = values.T
     return float((w * excess).sum() / (w.square() * variance).sum().sqrt())
 
 
@@ -215,44 +214,49 @@ def correct_flow(
         \bigl[-\log q(\theta \mid A z_s + b + e)\bigr]
 
     The optimum is the posterior with the discrepancy integrated out. Every step draws
-    new rows, corrections and errors, so that no simulations are held out. With
-    ``space="input"`` all of NPE is trained, otherwise the density alone, for
-    ``num_steps`` or in courses, which end earlier in a stack. With ``"tuned"`` the
-    caller puts a tuned net and the constants in the place of h. Simulations are
-    parameters from the prior and representations, ``(n_s, d)`` and ``(n_s, l)``.
+    new rows, corrections and errors. With ``space="input"`` all of NPE is trained,
+    otherwise the density alone, for ``num_steps`` or in courses, which end earlier in a
+    stack. With ``"tuned"`` the caller puts a tuned net and the constants in the place
+    of h. Simulations are theta ``(n_s, d)`` from the prior and z ``(n_s, l)``.
     """
     theta, z = simulations
-    unit = Standardisation(z.double())
-    z, count = unit(z.double()), len(versions)
-    net, constants = embedding_of(estimator), nn.Identity()
+    whole, training, unit = (
+        space == "input",
+        TRAINING[space],
+        Standardisation(z.double()),
+    )
+    z, count, net = unit(z.double()), len(versions), embedding_of(estimator)
+    courses = Courses(math.inf) if num_steps else COURSES
+    if in_a_stack:
+        most = IN_A_STACK.max_num if has_parameters(net) else 1
+        courses = replace(IN_A_STACK, growth=2 if whole else 4, max_num=most)
+    constants: nn.Module = nn.Identity()
     if not unit.varies.all():
         constants = SimulatedConstants(unit)
-        order = (constants, net) if space == "input" else (net, constants)
-        net = nn.Sequential(*order)
-    flow = Flow.of([estimator] * count, nets=[net] * (count if space == "input" else 1))
-    network = flow if space == "input" else flow.densities
-    losses = flow.losses if space == "input" else flow.losses_given
+        net = nn.Sequential(*((constants, net) if whole else (net, constants)))
+    flow = Flow.of([estimator] * count, nets=[net] * (count if whole else 1))
     size = max(1, min(NUM_DRAWS, MAX_ENTRIES // z.shape[1] ** 2 // count))
     block = 1 if size == NUM_DRAWS else BLOCK
     draws = DiscrepancyDraws.joined(
         one.sample(size, smallest_error=SMALLEST_ERROR[space]) for one, _ in versions
     )
-    equal = torch.full((len(theta),), 1.0 / len(theta), dtype=torch.double)
+    equal = torch.ones(len(theta), dtype=torch.double) / len(theta)
     upper = torch.stack([equal if p is None else p.cpu().double() for _, p in versions])
     upper = upper.cumsum(dim=1)
 
-    def batch(count: int) -> tuple[Tensor, Tensor]:
-        """Draw theta and corrected z for each copy, ``(E, count, ...)``."""
-        uniform = torch.rand(len(upper), count, dtype=torch.double) * upper[:, -1:]
+    def batch(num_rows: int) -> tuple[Tensor, Tensor]:
+        """Draw theta and corrected z for each copy, ``(E, num_rows, ...)``."""
+        uniform = torch.rand(count, num_rows, dtype=torch.double) * upper[:, -1:]
         rows = torch.searchsorted(upper, uniform).clamp_max(len(theta) - 1)
         rows = rows.to(z.device)
-        draw = torch.randint(size, (len(rows), count // block))
-        draw = (draw + size * torch.arange(len(rows))[:, None]).to(z.device)
+        draw = torch.randint(size, (count, num_rows // block))
+        draw = (draw + size * torch.arange(count)[:, None]).to(z.device)
         corrected = draws.correct(z[rows.flatten()], draw.flatten())
         corrected = unit.undo(corrected.unflatten(0, rows.shape))
         return theta[rows], corrected.to(theta)
 
     def mean_loss(theta: Tensor, z: Tensor) -> Tensor:
+        losses = flow.losses if whole else flow.losses_given
         return losses(theta, z).mean(dim=1)
 
     def compared_loss(*held_out: Tensor) -> Tensor:
@@ -261,14 +265,8 @@ def correct_flow(
             of_each = [mean_loss(*some) for some in zip(*parts, strict=True)]
         return torch.stack(of_each).mean(dim=0)
 
-    training = TRAINING[space]
-    courses = Courses(math.inf) if num_steps else COURSES
-    if in_a_stack:
-        courses = replace(IN_A_STACK, growth=2 if space == "input" else 4)
-        if not has_parameters(embedding_of(estimator)):
-            courses = replace(courses, max_num=1)
     histories = fit(
-        network,
+        flow if whole else flow.densities,
         lambda step: [batch(training.training_batch_size)],
         mean_loss,
         training,

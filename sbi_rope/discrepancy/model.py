@@ -1,9 +1,8 @@
 r"""A Bayesian linear model of how real observations differ from simulations."""
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from statistics import fmean
 
@@ -12,13 +11,13 @@ import torch
 from torch import Tensor
 
 from sbi_rope.data.pairs import groups_of
-from sbi_rope.discrepancy.posterior import Discrepancy, rounding
-from sbi_rope.discrepancy.regression import (
-    Conditional,
-    GroupErrors,
+from sbi_rope.discrepancy.posterior import (
+    Discrepancy,
+    Judged,
     Regressions,
     independent_pairs,
     log_density_of_right,
+    rounding,
 )
 from sbi_rope.utils.seeds import seeded
 from sbi_rope.utils.settings import Settings, UnitInterval
@@ -28,11 +27,10 @@ from sbi_rope.utils.tensors import as_batch
 # below .2 matter for large groups only; together they are as probable as another one.
 VARIANCE_RATIOS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 PRIOR_OF_RATIOS = (1 / 30,) * 5 + (1 / 6,) * 5
-# Chains that are run side by side, which costs hardly more than one of them.
-NUM_CHAINS = 10
-# The first imputations of a chain depend on its start. Those that are kept are so far
-# apart that they are nearly independent for labels as noisy as the prior is wide.
-NUM_WARM_UP, NUM_KEPT, APART = 100, 2, 30
+# Chains that are run side by side. Their first imputations depend on the start. Those
+# that are kept are so far apart that they are nearly independent for labels as noisy as
+# the prior is wide.
+NUM_CHAINS, NUM_WARM_UP, NUM_KEPT, APART = 10, 100, 2, 30
 # Numbers in the largest tensor, unless one chain needs more.
 MAX_ENTRIES = 2**22
 # Draws of the discrepancy that an expected mean is averaged over.
@@ -60,26 +58,24 @@ class DiscrepancyModel(Settings):
         (A, b) \mid \Sigma \sim \mathcal{MN}\bigl((I, 0), K^{-1}, \Sigma\bigr), \quad
         K = \operatorname{diag}(k + 4 l C_{11}, \ldots, k + 4 l C_{ll}, k / 3),
 
-    so that the posterior has the same form and the evidence has a closed form. The
-    shape V is I, or :math:`D^2` with the noise of simulations in each entry, relative
-    to the largest: a precise entry may have a smaller error, too. The noise in K keeps
-    what is uncertain about A from adding more than a quarter of :math:`\Sigma` to the
-    noise. V and the hyper-parameters k, s and :math:`\nu` are averaged over a grid,
-    weighted by their evidence, so that there is nothing to choose.
+    so that posterior and evidence have closed forms. The shape V is I, or :math:`D^2`
+    with the noise of simulations in each entry, relative to the largest: a precise
+    entry may have a smaller error, too. The noise in K keeps what is uncertain about A
+    from adding more than a quarter of :math:`\Sigma` to the noise. V and the
+    hyper-parameters k, s and :math:`\nu` are averaged over a grid, weighted by their
+    evidence, so that there is nothing to choose.
 
     Recordings of one person or specimen can have errors in common. If these have the
     correlation :math:`\rho`, a group of k pairs counts as
     :math:`k / (1 + (k - 1)\, \rho)` independent ones (Kish's design effect), with the
     mean of :math:`\rho` over a grid, weighted by the evidence. The covariance of the
-    errors is that of all pairs, because a person can be unusual in some entries of z
-    only. Whether the simulator is right is judged with each group as one pair.
+    errors is that of all pairs, because a person can be unusual in some entries only.
 
     The average contains the model :math:`z_i \mid \theta_i \sim \mathcal N(m_i, C)`, in
     which the simulator is right. If it is, the probability of this model goes to one
-    with more pairs, and nothing is corrected. An exception are simulators whose noise
-    varies by a factor of several with the parameters, because C is the same for all
-    pairs. :class:`DiscrepancyNPE` and stacks set the probability to zero if the pairs
-    refute the simulator by themselves.
+    with more pairs, and nothing is corrected, unless the noise of the simulator varies
+    by a factor of several with the parameters. :class:`DiscrepancyNPE` and stacks set
+    the probability to zero if the pairs refute the simulator by themselves.
 
     All quantities are in standard deviations of simulations from the prior.
 
@@ -97,13 +93,10 @@ class DiscrepancyModel(Settings):
 
     Example:
         >>> z_s = torch.linspace(-1.0, 1.0, 20)[:, None]
-        >>> noise = torch.tensor([[0.01]])
-        >>> discrepancy = DiscrepancyModel().fit(0.5 * z_s + 2.0, z_s, noise)
-        >>> draws = discrepancy.sample(1000, seed=0)
-        >>> round(float(draws.gain.mean()), 1), round(float(draws.offset.mean()), 1)
+        >>> found = DiscrepancyModel().fit(0.5 * z_s + 2.0, z_s, torch.tensor([[0.01]]))
+        >>> gain, offset, _ = found.sample(1000, seed=0)
+        >>> round(float(gain.mean()), 1), round(float(offset.mean()), 1)
         (0.5, 2.0)
-        >>> discrepancy.probability_of_none < 1e-3
-        True
     """
 
     gain_precisions: Sequence[float] = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 1000.0)
@@ -146,85 +139,65 @@ class DiscrepancyModel(Settings):
                 as well: a group counts as fewer pairs anyway.
             seed: Seed of the imputations.
         """
-        width = np.shape(z)[-1:]
+        width, possible = np.shape(z)[-1:], np.shape(mean)[1:-1][:1]
         z = as_batch("z", z, width).double()
-        possible = np.shape(mean)[1:-1][:1]
         mean = as_batch("mean", mean, (*possible, *width), rows=len(z)).to(z)
-        if possible == (1,):
-            mean = mean[:, 0]
         covariance = as_batch("covariance", covariance, width, rows=width[0]).to(z)
         noise = covariance + rounding(covariance).diag()
         weights = torch.ones(len(z)) if weights is None else weights
         weights = as_batch("weights", weights, (), rows=len(z)).to(z)
         if groups is not None:
-            groups = groups_of(as_batch("groups", groups, (), rows=len(z)))
-            groups = None if len(groups.unique()) == len(z) else groups.to(z.device)
-        # Whether the simulator is right is judged with each group as one pair. With a
-        # correlation that is a little too low, a right simulator would be refuted.
-        once = weights if groups is None else independent_pairs(groups, 1.0, weights)
+            groups = groups_of(as_batch("groups", groups, (), rows=len(z))).to(z.device)
+            groups = None if len(groups.unique()) == len(z) else groups
+        once = weights
+        if groups is not None:
+            once = independent_pairs(groups, 1.0, weights)
+        precisions = z.new_tensor(self.gain_precisions)
+        grids = z.new_tensor(self.error_scales), z.new_tensor(self.degrees_of_freedom)
+        settings = torch.cartesian_prod(*grids)
+        regress = partial(Regressions.of, z, noise=noise, settings=settings)
 
         def counts(mean: Tensor) -> Tensor:
+            """Return how many independent pairs each counts as, for B sets of means."""
             if groups is None:
                 return weights
-            correlations = self._correlations_within(groups, z, mean, noise)
-            return independent_pairs(groups, correlations, weights)
+            ratios, ones = torch.tensor(VARIANCE_RATIOS).to(z), torch.ones_like(weights)
+            correlations = ratios / (1 + ratios)
+            evidence = [
+                # Half of the precisions are enough to compare correlations.
+                regress(
+                    mean, ones, precisions[::2], groups=groups, correlation=one
+                ).log_evidence.logsumexp(dim=(1, 2))
+                for one in correlations.tolist()
+            ]
+            log_prior = torch.tensor(PRIOR_OF_RATIOS).to(z).log()
+            shares = (torch.stack(evidence, dim=1) + log_prior).softmax(dim=1)
+            return independent_pairs(groups, shares @ correlations, weights)
 
-        conditional = partial(self._conditional, z=z, noise=noise, once=once)
-        if mean.ndim == 2:
-            [discrepancy] = conditional(mean[None], counts(mean[None])).posteriors()
-            return discrepancy
-        with seeded(seed):
-            return impute(z, mean, conditional, counts)
+        def posterior(mean: Tensor, weights: Tensor) -> tuple[Regressions, Judged]:
+            found = judged = regress(mean, weights, precisions)
+            if groups is not None:
+                # Whether the simulator is right is judged with each group as one pair.
+                # With a correlation that is too low, a right one would be refuted.
+                judged = regress(mean, once, precisions)
+            evidence = judged.log_evidence
+            off = evidence.logsumexp(dim=(1, 2)) - math.log(evidence[0].numel())
+            right = log_density_of_right(z - mean, noise, once)
+            prior = torch.logit(off.new_tensor(self.probability_of_none))
+            return found, Judged(off, right, torch.sigmoid(right - off + prior))
 
-    def _conditional(
-        self, mean: Tensor, weights: Tensor, *, z: Tensor, noise: Tensor, once: Tensor
-    ) -> Conditional:
-        """Return the posteriors given B sets of means, shape ``(B, n, l)``."""
-        settings, precisions = self._settings, self.gain_precisions
-        regressions = Regressions.of(z, mean, precisions, weights, noise)
-        log_evidence = judged = regressions.log_evidence(settings)
-        if once is not weights:
-            as_one_pair = Regressions.of(z, mean, precisions, once, noise)
-            judged = as_one_pair.log_evidence(settings)
-        average = judged.logsumexp(dim=(1, 2)) - math.log(judged[0].numel())
-        right = log_density_of_right(z - mean, noise, once)
-        prior = torch.logit(average.new_tensor(self.probability_of_none))
-        return Conditional(
-            regressions=regressions,
-            log_evidence=log_evidence,
-            settings=settings,
-            noise=noise,
-            average=average,
-            right=right,
-            probability_of_none=torch.sigmoid(right - average + prior),
-            num_pairs=len(z),
-        )
-
-    def _correlations_within(
-        self, groups: Tensor, z: Tensor, mean: Tensor, noise: Tensor
-    ) -> Tensor:
-        """Return the mean correlation within groups, for each set of means."""
-        ratios = torch.tensor(VARIANCE_RATIOS).to(z)
-        correlations = ratios / (1 + ratios)
-        # Half of the precisions are enough to compare correlations.
-        precisions, ones = self.gain_precisions[::2], torch.ones(len(z)).to(z)
-        evidence = []
-        for correlation in correlations.tolist():
-            errors = GroupErrors(groups=groups, correlation=correlation)
-            some = Regressions.of(z, mean, precisions, ones, noise, errors=errors)
-            evidence.append(some.log_evidence(self._settings).logsumexp(dim=(1, 2)))
-        log_prior = torch.tensor(PRIOR_OF_RATIOS).to(z).log()
-        return (torch.stack(evidence, dim=1) + log_prior).softmax(dim=1) @ correlations
-
-    @property
-    def _settings(self) -> list[tuple[float, float]]:
-        return list(itertools.product(self.error_scales, self.degrees_of_freedom))
+        if possible and possible != (1,):
+            with seeded(seed):
+                return impute(z, mean, posterior, counts)
+        mean = mean.reshape(1, *z.shape)
+        found, judged = posterior(mean, counts(mean))
+        return found.posteriors(judged)[0]
 
 
 def impute(
     z: Tensor,
     possible: Tensor,
-    conditional: Callable[[Tensor, Tensor], Conditional],
+    posterior: Callable[[Tensor, Tensor], tuple[Regressions, Judged]],
     counts: Callable[[Tensor], Tensor],
 ) -> Discrepancy:
     r"""Average the posterior over imputed means, by Gibbs sampling in C chains.
@@ -236,28 +209,30 @@ def impute(
     """
     mean = possible.mean(dim=1).expand(NUM_CHAINS, -1, -1)
     weights = counts(mean)
-    given = conditional(mean, weights)
+    found, judged = posterior(mean, weights)
     kept: list[Discrepancy] = []
     for number in range(1, NUM_WARM_UP + NUM_KEPT * APART + 1):
-        mean = _imputed(z, possible, *given.draw())
+        probabilities = _probabilities(z, possible, *found.draw(judged))
+        # Faster than torch.multinomial, which draws a number for each of the means.
+        bounds = probabilities.cumsum(dim=-1)
+        drawn = torch.rand(bounds.shape[:-1]).to(bounds) * bounds[..., -1]
+        chosen = torch.searchsorted(bounds, drawn[..., None], right=True)[..., 0]
+        mean = possible[torch.arange(len(z)), chosen.clamp_max(possible.shape[1] - 1)]
         if number == NUM_WARM_UP:
             weights = counts(mean)
-        given = conditional(mean, weights)
+        found, judged = posterior(mean, weights)
         if number > NUM_WARM_UP and (number - NUM_WARM_UP) % APART == 0:
-            kept.extend(given.posteriors())
-    shares = torch.cat([(1 - one.probability_of_none) * one.shares for one in kept])
-    total = shares.sum()
-    if not total > 0:  # the simulator is right in all of them
-        shares, total = torch.cat([one.shares for one in kept]), float(len(kept))
-    return Discrepancy(
+            kept.extend(found.posteriors(judged))
+    # They are not zero, even if the simulator is right in all of them.
+    off = [max(1 - one.probability_of_none, 1e-290) for one in kept]
+    shares = torch.cat([p * one.shares for p, one in zip(off, kept, strict=True)])
+    names = "probability_of_none", "log_evidence", "log_evidence_of_none"
+    return replace(
+        kept[0],
         terms=tuple(term for one in kept for term in one.terms),
-        shares=shares / total,
-        noise=given.noise,
-        probability_of_none=fmean(one.probability_of_none for one in kept),
-        log_evidence=fmean(one.log_evidence for one in kept),
-        log_evidence_of_none=fmean(one.log_evidence_of_none for one in kept),
-        num_pairs=len(z),
+        shares=shares / shares.sum(),
         num_independent=fmean(one.num_independent for one in kept),
+        **{name: fmean(getattr(one, name) for one in kept) for name in names},
     )
 
 
@@ -277,18 +252,6 @@ def expected_means(discrepancy: Discrepancy, z: Tensor, possible: Tensor) -> Ten
     return (probabilities[..., None] * possible).sum(dim=1)
 
 
-def _imputed(
-    z: Tensor, possible: Tensor, gain: Tensor, offset: Tensor, covariance: Tensor
-) -> Tensor:
-    """Draw one of the possible means of each observation, shape ``(C, n, l)``."""
-    probabilities = _probabilities(z, possible, gain, offset, covariance)
-    # Faster than torch.multinomial, which draws a number for each of the means.
-    bounds = probabilities.cumsum(dim=-1)
-    drawn = torch.rand(bounds.shape[:-1]).to(bounds) * bounds[..., -1]
-    chosen = torch.searchsorted(bounds, drawn[..., None], right=True)[..., 0]
-    return possible[torch.arange(len(z)), chosen.clamp_max(possible.shape[1] - 1)]
-
-
 def _probabilities(
     z: Tensor, possible: Tensor, gain: Tensor, offset: Tensor, covariance: Tensor
 ) -> Tensor:
@@ -306,7 +269,7 @@ def _probabilities(
             seen[:, :, None],
             (flat @ to_seen.mT).unflatten(1, possible.shape[:2]),
             compute_mode="donot_use_mm_for_euclid_dist",
-        )[:, :, 0]
+        )
         for seen, to_seen in parts
     ]
-    return torch.softmax(-torch.cat(distances).square() / 2, dim=-1)
+    return torch.softmax(-torch.cat(distances)[:, :, 0].square() / 2, dim=-1)

@@ -1,11 +1,13 @@
-"""The posterior of gain, offset and error, and draws from it."""
+"""The posterior of gain, offset and error given means of simulations, and draws."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.distributions import Chi2
+from torch.distributions import Chi2, MultivariateNormal
 
 from sbi_rope.utils.seeds import seeded
 from sbi_rope.utils.tensors import as_batch
@@ -18,6 +20,14 @@ SMALLEST_SCALE = 0.01
 # prior, times D. Some statistics have no noise. x can be more precise than h(x).
 SMALLEST_NOISE = 0.01
 SMALLEST_ERROR = {"embedding": 0.01, "tuned": 0.01, "input": 0.003}
+# The prior precision of the offset is this share of the precision of the gain.
+OFFSET_PRECISION = 1 / 3
+# The prior precision of the gain is at least this times the noise C of each entry and
+# the number of entries. Otherwise, the noise of imprecise entries leaks into a precise
+# one, along directions in which the means of the pairs do not vary.
+LEAST_PRECISION = 4.0
+# Settings with less than this share of the evidence of the best one are left out.
+NEGLIGIBLE = 1e-4
 
 
 def noise_scale(covariance: Tensor) -> Tensor:
@@ -74,9 +84,8 @@ class Discrepancy:
         log_evidence: Log density of the pairs under a discrepancy, where each group
             counts as one pair.
         log_evidence_of_none: The same if the simulator is right.
-        num_pairs: The number of calibration pairs.
-        num_independent: How many independent pairs these count as: the sum of their
-            weights, or less if pairs of a group have errors in common.
+        num_independent: How many independent pairs the calibration pairs count as: the
+            sum of their weights, or less if pairs of a group have errors in common.
     """
 
     terms: tuple[Term, ...] = field(repr=False)
@@ -85,7 +94,6 @@ class Discrepancy:
     probability_of_none: float
     log_evidence: float
     log_evidence_of_none: float
-    num_pairs: int
     num_independent: float
 
     @torch.no_grad()
@@ -104,38 +112,26 @@ class Discrepancy:
                 :math:`D^{-1} \Sigma' D^{-1}`, see :class:`DiscrepancyModel`.
             seed: Seed of the draws; None uses torch's state.
         """
-        none = self.probability_of_none
+        none, scale = self.probability_of_none, noise_scale(self.noise)
         shares = torch.cat([(1 - none) * self.shares, self.shares.new_tensor([none])])
         with seeded(seed):
             chosen = torch.multinomial(shares, num_draws, replacement=True)
             *counts, num_none = chosen.bincount(minlength=len(shares)).tolist()
-            parts = [
-                self._corrections(term, count, smallest_error)
-                for term, count in zip(self.terms, counts, strict=True)
-                if count
-            ]
-        no_error = self.noise.new_zeros(num_none, *self.noise.shape)
-        no_correction = DiscrepancyDraws(
-            gain=no_error + torch.eye(len(self.noise)).to(no_error),
-            offset=no_error[:, 0],
-            error_factor=no_error,
-        )
-        return DiscrepancyDraws.joined([*parts, no_correction])
-
-    def _corrections(
-        self, term: Term, count: int, smallest_error: float
-    ) -> "DiscrepancyDraws":
-        gain, offset, covariance = term.sample(count)
-        scale = noise_scale(self.noise)
+            of_terms = zip(self.terms, counts, strict=True)
+            parts = [term.sample(count) for term, count in of_terms if count]
+            parts = parts or [self.terms[0].sample(0)]
+        gain, offset, covariance = map(torch.cat, zip(*parts, strict=True))
         error = covariance - gain @ self.noise @ gain.mT
         variance, directions = torch.linalg.eigh(error / scale / scale[:, None])
         std = variance.clamp_min(smallest_error**2).sqrt()
         factor = scale[:, None] * directions * std[:, None, :]
-        return DiscrepancyDraws(gain=gain, offset=offset, error_factor=factor)
+        no_error = self.noise.new_zeros(num_none, *self.noise.shape)
+        same = no_error + torch.eye(len(scale)).to(no_error)
+        draws = (gain, offset, factor), (same, no_error[:, 0], no_error)
+        return DiscrepancyDraws.joined(draws)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class DiscrepancyDraws:
+class DiscrepancyDraws(NamedTuple):
     r"""Draws of gain, offset and error.
 
     Attributes:
@@ -149,14 +145,9 @@ class DiscrepancyDraws:
     error_factor: Tensor
 
     @classmethod
-    def joined(cls, parts: "Iterable[DiscrepancyDraws]") -> "DiscrepancyDraws":
+    def joined(cls, parts: Iterable[tuple[Tensor, ...]]) -> "DiscrepancyDraws":
         """Return all draws of several sets, one set after the other."""
-        all_of = ((one.gain, one.offset, one.error_factor) for one in parts)
-        gain, offset, factor = map(torch.cat, zip(*all_of, strict=True))
-        return cls(gain=gain, offset=offset, error_factor=factor)
-
-    def __len__(self) -> int:
-        return len(self.offset)
+        return cls(*map(torch.cat, zip(*parts, strict=True)))
 
     def correct(self, z_s: Tensor, draw: Tensor | None = None) -> Tensor:
         """Return simulations as they would be observed in reality, with own errors.
@@ -169,16 +160,206 @@ class DiscrepancyDraws:
         Returns:
             Shape ``(n, l)``, float64.
         """
-        z_s = as_batch("z_s", z_s, self.offset.shape[1:])
+        z_s = as_batch("z_s", z_s, self.offset.shape[1:]).double()
         if draw is None:
-            draw = torch.randint(len(self), (len(z_s),)).to(z_s.device)
-        blocks = z_s.double().reshape(len(draw), -1, z_s.shape[1])
-        noise = torch.randn(z_s.shape, dtype=torch.double).to(blocks)
+            draw = torch.randint(len(self.offset), (len(z_s),)).to(z_s.device)
+        noise = torch.randn(z_s.shape, dtype=torch.double).to(z_s)
+        blocks = (one.reshape(len(draw), -1, z_s.shape[1]) for one in (z_s, noise))
         # A matrix for each draw needs a lot of memory if z has many entries.
         size = max(1, MAX_ENTRIES // z_s.shape[1] ** 2)
-        corrected = []
-        parts = (rows.split(size) for rows in (blocks, draw, noise.reshape_as(blocks)))
-        for z, which, standard in zip(*parts, strict=True):
-            moved = self.offset[which][:, None] + z @ self.gain[which].mT
-            corrected.append(moved + standard @ self.error_factor[which].mT)
+        parts = zip(draw.split(size), *(one.split(size) for one in blocks), strict=True)
+        corrected = [
+            self.offset[which][:, None]
+            + z @ self.gain[which].mT
+            + standard @ self.error_factor[which].mT
+            for which, z, standard in parts
+        ]
         return torch.cat(corrected).reshape_as(z_s)
+
+
+def decorrelated(
+    values: Tensor, groups: Tensor, correlation: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    r"""Return :math:`R^{-1/2}` times values, log det R and the trace of 1 / R.
+
+    R is the correlation of the errors of n pairs, which have one within groups. Groups
+    are numbered from 0 on, ``(n,)``, and values have the shape ``(*batch, n, k)``.
+    """
+    sizes = groups.bincount().to(values)
+    sums = values.new_zeros(*values.shape[:-2], len(sizes), values.shape[-1])
+    mean = sums.index_add(-2, groups, values) / sizes[:, None]
+    mean = mean[..., groups, :]
+    # The eigenvalues of R: of the mean of each group, and of differences within groups.
+    of_means, within = 1 + (sizes - 1) * correlation, 1 - correlation
+    white = mean / of_means[groups, None].sqrt() + (values - mean) / within**0.5
+    num_within = len(groups) - len(sizes)
+    log_det = of_means.log().sum() + num_within * math.log(within)
+    return white, log_det, of_means.reciprocal().sum() + num_within / within
+
+
+def independent_pairs(
+    groups: Tensor, correlation: float | Tensor, weights: Tensor
+) -> Tensor:
+    """Return how many independent pairs each counts as (Kish), ``(*batch, n)``."""
+    w = weights.double()
+    # The effective number of pairs of each group, if their weights differ.
+    number = groups.bincount(weights=w).square() / groups.bincount(weights=w.square())
+    correlation = torch.as_tensor(correlation).to(w)[..., None]
+    return w / (1 + (number[groups] - 1) * correlation)
+
+
+class Judged(NamedTuple):
+    """Whether the simulator is right, given each of B sets of means, ``(B,)``."""
+
+    off: Tensor  # the log density of the pairs under a discrepancy
+    right: Tensor  # that if the simulator is right
+    probability_of_none: Tensor
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Regressions:
+    """Real observations regressed on B sets of simulated means, for all priors.
+
+    A prior has one of K forms, each a precision of the gain and a shape of the error,
+    which is the identity or D. It has one of S further settings, each a scale of the
+    error and its strength.
+    """
+
+    coefficients: Tensor  # means of (A, b)', (B, K, l + 1, l)
+    row_factor: Tensor  # of the covariances of their rows, (B, K, l + 1, l + 1)
+    shapes: Tensor  # the diagonals of the shapes, (K, l)
+    # Eigenvalues and vectors of the scatter matrices of the residuals in units of the
+    # shape, (B, K, l) and (B, K, l, l).
+    variances: Tensor
+    directions: Tensor
+    num_pairs: Tensor  # the sum of the weights of the pairs, (B,)
+    noise: Tensor  # C, the covariance of simulations at one parameter, (l, l)
+    settings: Tensor  # (S, 2)
+    log_evidence: Tensor  # the log density of the pairs, (B, K, S)
+
+    @classmethod
+    def of(
+        cls,
+        z: Tensor,
+        mean: Tensor,
+        weights: Tensor,
+        precisions: Tensor,
+        *,
+        noise: Tensor,
+        settings: Tensor,
+        groups: Tensor | None = None,
+        correlation: float = 0.0,
+    ) -> "Regressions":
+        """Return the conjugate posteriors of the coefficients and the evidence.
+
+        Means have the shape ``(B, n, l)``, and weights ``(n,)`` or ``(B, n)``. They are
+        one if errors are correlated within groups.
+        """
+        width = mean.shape[2]
+        identity = torch.eye(width).to(z)
+        prior_mean = torch.cat([identity, torch.zeros_like(identity[:1])])
+        precision = precisions[:, None].repeat(1, width + 1)
+        precision[:, -1] *= OFFSET_PRECISION
+        precision[:, :-1] += LEAST_PRECISION * width * noise.diagonal()
+        design = torch.cat([mean, torch.ones_like(mean[..., :1])], dim=-1)
+        # Relative to the prior mean, residuals are small, and so are rounding errors.
+        rows = torch.cat([z - design @ prior_mean, design], dim=-1)
+        rows = rows * weights.sqrt()[..., None]
+        num_pairs = weights.sum(dim=-1).expand(len(mean))
+        num_rounded, log_det_errors = num_pairs[:, None, None, None], 0.0
+        if groups is not None:
+            # Pairs are rounded one by one, whatever errors of a group have in common.
+            rows, log_det_errors, num_rounded = decorrelated(rows, groups, correlation)
+        # From here on there is a dimension for the K precisions.
+        residual, design = rows[:, None].split([width, width + 1], dim=-1)
+        factor = torch.linalg.cholesky(torch.diag_embed(precision) + design.mT @ design)
+        shift = torch.cholesky_solve(design.mT @ residual, factor)
+        # This is a sum of squares. The usual difference of two terms could be negative.
+        left_over = residual - design @ shift
+        scatter = left_over.mT @ left_over + shift.mT @ (precision[..., None] * shift)
+        # No z is known more precisely than rounded, even if pairs agree exactly.
+        scatter = scatter + num_rounded * rounding(noise).diag()
+        log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(dim=-1)
+        log_volume = width / 2 * (precision.log().sum(1) - log_det - log_det_errors)
+        row_factor = torch.linalg.cholesky(torch.cholesky_inverse(factor))
+        # From here on both shapes follow each other in the dimension of the precisions.
+        scale = noise_scale(noise)
+        shapes = torch.stack([torch.ones_like(scale), scale]).unique(dim=0)
+        several = len(shapes)
+        shapes = shapes.repeat_interleave(len(precision), dim=0)
+        scatter = scatter.repeat(1, several, 1, 1) / shapes[:, None] / shapes[..., None]
+        variances, directions = torch.linalg.eigh(scatter)
+        variances = variances.clamp_min(0.0)
+        log_volume = log_volume.repeat(1, several)
+        log_volume = log_volume - num_pairs[:, None] * shapes.log().sum(dim=1)
+        # From here on there is a dimension for the S settings.
+        n, (error_scale, strength) = num_pairs[:, None, None], settings.T
+        prior_scale, degrees = strength * error_scale.square(), strength + width + 1
+        log_det = (variances[..., None, :] + prior_scale[:, None]).log().sum(dim=-1)
+        return cls(
+            coefficients=(prior_mean + shift).repeat(1, several, 1, 1),
+            row_factor=row_factor.repeat(1, several, 1, 1),
+            shapes=shapes,
+            variances=variances,
+            directions=directions,
+            num_pairs=num_pairs,
+            noise=noise,
+            settings=settings,
+            log_evidence=-n * width / 2 * math.log(math.pi)
+            + log_volume[..., None]
+            + degrees / 2 * width * prior_scale.log()
+            - (degrees + n) / 2 * log_det
+            + torch.special.multigammaln((degrees + n) / 2, width)
+            - torch.special.multigammaln(degrees / 2, width),
+        )
+
+    def at(self, b: Any, k: Any, s: Any) -> Term:
+        """Return the posterior for one set, form and setting, or for m, ``(m,)``."""
+        error_scale, strength = self.settings[s].unbind(dim=-1)
+        scale = self.variances[b, k] + (strength * error_scale.square())[..., None]
+        error_factor = self.directions[b, k] * scale[..., None, :].sqrt()
+        return Term(
+            coefficients=self.coefficients[b, k],
+            row_factor=self.row_factor[b, k],
+            error_factor=self.shapes[k][..., None] * error_factor,
+            degrees=strength + scale.shape[-1] + 1 + self.num_pairs[b],
+        )
+
+    def posteriors(self, judged: Judged) -> list[Discrepancy]:
+        """Return for each set the average over settings with evidence for them."""
+        found = []
+        for b, evidence in enumerate(self.log_evidence):
+            kept = evidence > evidence.max() + math.log(NEGLIGIBLE)
+            one = Discrepancy(
+                terms=tuple(self.at(b, k, s) for k, s in kept.nonzero().tolist()),
+                shares=torch.softmax(evidence[kept], dim=0),
+                noise=self.noise,
+                probability_of_none=float(judged.probability_of_none[b]),
+                log_evidence=float(judged.off[b]),
+                log_evidence_of_none=float(judged.right[b]),
+                num_independent=float(self.num_pairs[b]),
+            )
+            found.append(one)
+        return found
+
+    def draw(self, judged: Judged) -> tuple[Tensor, Tensor, Tensor]:
+        """Draw a gain, an offset and the covariance of z given theta for each set."""
+        probabilities = self.log_evidence.flatten(1).softmax(dim=1)
+        chosen = torch.multinomial(probabilities, 1)[:, 0]
+        b, count = torch.arange(len(chosen), device=chosen.device), len(self.settings)
+        drawn = self.at(b, chosen // count, chosen % count).sample(1)
+        gain, offset, covariance = (values[0] for values in drawn)
+        none = torch.rand(len(chosen)).to(gain) < judged.probability_of_none
+        none, identity = none[:, None, None], torch.eye(len(self.noise)).to(gain)
+        return (
+            torch.where(none, identity, gain),
+            offset.masked_fill(none[:, 0], 0.0),
+            torch.where(none, self.noise, covariance),
+        )
+
+
+def log_density_of_right(residual: Tensor, noise: Tensor, weights: Tensor) -> Tensor:
+    """Return the log density of z - m, ``(B,)``, rounded as ``Regressions`` do."""
+    log_density = MultivariateNormal(torch.zeros_like(noise[0]), noise).log_prob
+    inexact = weights.sum() * (rounding(noise) * torch.linalg.inv(noise).diagonal())
+    return (weights * log_density(residual)).sum(dim=1) - inexact.sum() / 2

@@ -1,11 +1,9 @@
 """The discrepancy between a simulator and reality, summary by summary."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
-import torch
+from scipy.stats import t
 from torch import Tensor
 
 from sbi_rope.data.simulate import Moments
@@ -13,21 +11,14 @@ from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.posterior import Discrepancy
 from sbi_rope.npe.standardisation import Standardisation
 from sbi_rope.utils.errors import InvalidInputError
-from sbi_rope.utils.progress import progress_bar
 
 NUM_DRAWS = 4000
-# A progress bar appears after this many seconds.
-DELAY = 2.0
 # The probability that a summary without outliers is reported to have one.
 FALSE_ALARMS = 0.01
 # The efficiency of a standard deviation that is estimated from a median distance.
 EFFICIENCY = 0.37
 # With fewer pairs one cannot tell which of them is the outlier.
 MIN_PAIRS_FOR_OUTLIERS = 10
-# If this share of the pairs are outliers, they are hardly all mistakes of labelling.
-MANY_OUTLIERS = 0.05
-# What is estimated with an interval.
-ESTIMATES = ("size", "shift", "gain", "error")
 
 
 @dataclass(frozen=True)
@@ -41,8 +32,7 @@ class Interval:
     @classmethod
     def of(cls, draws: Tensor) -> "Interval":
         """Return the quantiles of draws, shape ``(m,)``."""
-        levels = torch.tensor([0.5, 0.025, 0.975]).to(draws)
-        return cls(*draws.quantile(levels).tolist())
+        return cls(*draws.quantile(draws.new_tensor([0.5, 0.025, 0.975])).tolist())
 
     def __str__(self) -> str:
         return f"{self.median:.3g} [{self.low:.3g}, {self.high:.3g}]"
@@ -69,7 +59,6 @@ class SummaryDiscrepancy:
         outliers: Rows of calibration pairs that do not fit the others. In 99 of 100
             summaries without outliers no pair is so far away by chance.
         std: The standard deviation of simulations from the prior, in the units of x.
-        num_independent: How many independent pairs the calibration pairs count as here.
     """
 
     name: str
@@ -79,7 +68,6 @@ class SummaryDiscrepancy:
     size: Interval
     probability_of_none: float
     std: float
-    num_independent: float
     outliers: tuple[int, ...] = ()
 
     @property
@@ -92,7 +80,8 @@ class SummaryDiscrepancy:
 class DiscrepancyReport:
     """The discrepancy of each summary, as estimated from calibration pairs.
 
-    Print it, or use :meth:`as_rows` and :func:`sbi_rope.plots.discrepancy`.
+    Print it, draw it with :func:`sbi_rope.plots.discrepancy`, or make a table of
+    ``dataclasses.asdict(summary)`` for each of its summaries.
 
     Attributes:
         summaries: The discrepancy of each summary, from the largest to the smallest.
@@ -113,11 +102,10 @@ class DiscrepancyReport:
     def renamed(self, names: Sequence[str]) -> "DiscrepancyReport":
         """Return the report of numbered summaries with names, in the order of x."""
         of_entry = {f"x[{j}]": name for j, name in enumerate(names)}
-        known = {*(summary.name for summary in self.summaries), *self.constant}
-        if known != set(of_entry) or len(set(names)) < len(names):
+        count = len(self.summaries) + len(self.constant)
+        if not count == len(names) == len(set(names)):
             raise InvalidInputError(
-                f"Expected `x_names` to be {len(known)} different names, of "
-                f"{sorted(known)}; got {list(names)}."
+                f"Expected `x_names` to be {count} different names; got {list(names)}."
             )
         return replace(
             self,
@@ -125,75 +113,42 @@ class DiscrepancyReport:
             constant=tuple(of_entry[name] for name in self.constant),
         )
 
-    def as_rows(self) -> list[dict[str, Any]]:
-        """Return a row for each summary, in the order of ``summaries``."""
-        rows = []
-        for summary in self.summaries:
-            row: dict[str, Any] = {"summary": summary.name}
-            for name in ESTIMATES:
-                ends: Interval = getattr(summary, name)
-                row |= {name: ends.median, f"{name}_low": ends.low}
-                row[f"{name}_high"] = ends.high
-            row["probability_of_none"] = summary.probability_of_none
-            row["outliers"] = list(summary.outliers)
-            rows.append(row | {"num_independent": summary.num_independent})
-        return rows
-
     @property
     def notes(self) -> list[str]:
-        """Sentences about constant summaries, groups of pairs, and outliers."""
+        """Sentences about constant summaries and outliers."""
         notes = []
         if self.constant:
             notes.append(f"The same in all simulations: {', '.join(self.constant)}.")
-        if self.num_groups < self.num_pairs:
-            numbers = {round(summary.num_independent) for summary in self.summaries}
-            count = " to ".join(map(str, sorted({min(numbers), max(numbers)})))
-            notes.append(
-                "Pairs of a group can have errors in common. Here, the "
-                f"{self.num_pairs} pairs count as {count} independent ones."
-            )
-        outliers: dict[int, list[str]] = {}
-        for summary in self.summaries:
-            for row in summary.outliers:
-                outliers.setdefault(row, []).append(summary.name)
+        outliers = sorted((row, s.name) for s in self.summaries for row in s.outliers)
         if outliers:
-            listed = [f"row {row} ({', '.join(n)})" for row, n in outliers.items()]
-            meaning = (
-                "Look whether a label or a measurement is wrong, or whether reality is "
-                "not linear in the simulation there."
+            listed = ", ".join(f"row {row} ({name})" for row, name in outliers)
+            notes.append(
+                f"Pairs that do not fit the others: {listed}. Look whether a label or "
+                "a measurement is wrong. If they are many, reality is rather not "
+                "linear in the simulation there."
             )
-            if len(outliers) > max(2.0, MANY_OUTLIERS * self.num_pairs):
-                meaning = (
-                    "So many suggest that reality is not linear in the simulation "
-                    "there, rather than that labels are wrong."
-                )
-            pairs = f"Pairs that do not fit the others: {'; '.join(listed)}. {meaning}"
-            notes.append(pairs)
         return notes
 
     def __str__(self) -> str:
         grouped = self.num_groups < self.num_pairs
         in_groups = f" in {self.num_groups} groups" if grouped else ""
+        off = [one for one in self.summaries if one.is_off]
+        fine = [one.name for one in self.summaries if not one.is_off]
         lines = [
             f"What {self.num_pairs} calibration pairs{in_groups} say about the "
             "simulator",
             "  observed = mean + shift + gain (simulated - mean) + error",
+            "  95 % intervals; size in standard deviations of simulations, shift and "
+            "error in units of x",
         ]
-        rows = [("summary", *ESTIMATES)] + [
-            (s.name, *(str(getattr(s, name)) for name in ESTIMATES))
-            for s in self.summaries
-            if s.is_off
-        ]
-        if len(rows) > 1:
-            lines.append(
-                "  95 % intervals; size in standard deviations of simulations, shift "
-                "and error in units of x"
-            )
+        if off:
+            names = ("name", "size", "shift", "gain", "error")
+            rows = [[str(getattr(one, name)) for name in names] for one in off]
+            rows.insert(0, ["summary", *names[1:]])
             widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-            lines += [
-                "  " + "  ".join(map(str.ljust, row, widths)).rstrip() for row in rows
-            ]
-        if fine := [summary.name for summary in self.summaries if not summary.is_off]:
+            cells = (map(str.ljust, row, widths) for row in rows)
+            lines += ["  " + "  ".join(row).rstrip() for row in cells]
+        if fine:
             lines.append(f"  no sign of discrepancy: {', '.join(fine)}")
         return "\n".join([*lines, *(f"  {note}" for note in self.notes)])
 
@@ -206,7 +161,6 @@ def report_discrepancy(
     model: DiscrepancyModel,
     weights: Tensor | None = None,
     groups: Tensor | None = None,
-    show_progress_bars: bool = False,
 ) -> DiscrepancyReport:
     """Fit the discrepancy of each summary of x ``(n, l)`` separately.
 
@@ -214,31 +168,26 @@ def report_discrepancy(
     light, is ambiguous. The gain of a single summary is not, and can be checked.
     """
     unit = Standardisation(simulated.double())
-    is_constant = (~unit.varies).tolist()
-    summaries, constant = [], []
-    for j in progress_bar(
-        range(x.shape[1]), show=show_progress_bars, desc="Summaries", delay=DELAY
-    ):
-        if is_constant[j]:
-            constant.append(f"x[{j}]")
-            continue
+    varying, summaries = unit.varies.nonzero()[:, 0].tolist(), []
+    if not varying:
+        raise InvalidInputError(
+            "Expected simulations that differ from each other; all summaries are "
+            "constant."
+        )
+    for j in varying:
         mean, std = unit.mean[j], unit.std[j]
         z = ((x[:, j].double() - mean) / std)[:, None]
         m = ((moments.means[..., j] - mean) / std)[..., None]
         noise = moments.covariance[:, j, j].mean() / std.square()
         found = model.fit(z, m, noise.reshape(1, 1), weights=weights, groups=groups)
         summaries.append(_summary(f"x[{j}]", found, z, m, scale=float(std)))
-    if not summaries:
-        raise InvalidInputError(
-            "Expected simulations that differ from each other; all summaries are "
-            "constant."
-        )
     summaries.sort(key=lambda s: (not s.is_off, -s.size.median))
+    constant = (~unit.varies).nonzero()[:, 0].tolist()
     return DiscrepancyReport(
         summaries=tuple(summaries),
         num_pairs=len(x),
         num_groups=len(x) if groups is None else len(groups.unique()),
-        constant=tuple(constant),
+        constant=tuple(f"x[{j}]" for j in constant),
     )
 
 
@@ -254,10 +203,19 @@ def _summary(
     error = draws.error_factor[:, 0, 0].abs()
     size = ((gain - 1).square() + shift.square() + error.square()).sqrt()
     outliers: tuple[int, ...] = ()
-    if mean.shape[1] == 1:  # otherwise a residual may come from the label
+    n, num_means = mean.shape[:2]
+    # Of several means, a residual may come from the label.
+    if num_means == 1 and n >= MIN_PAIRS_FOR_OUTLIERS:
         residual = (z - gain.median() * mean[:, 0] - shift.median())[:, 0]
+        distance = (residual - residual.median()).abs()
         noise = float(gain.median().abs() * discrepancy.noise[0, 0].sqrt())
-        outliers = _outliers(residual, noise)
+        # The median distance of a normal variable from its median is 0.6745 standard
+        # deviations.
+        std = (distance.median() / 0.6745).clamp_min(noise)
+        # The furthest of n values exceeds this quantile with a probability of 1 %. The
+        # standard deviation is an estimate, hence Student's t.
+        furthest = float(t.isf(FALSE_ALARMS / (2 * n), EFFICIENCY * (n - 1)))
+        outliers = tuple((distance > furthest * std).nonzero().flatten().tolist())
     return SummaryDiscrepancy(
         name=name,
         gain=Interval.of(gain),
@@ -267,23 +225,4 @@ def _summary(
         probability_of_none=discrepancy.probability_of_none,
         outliers=outliers,
         std=scale,
-        num_independent=discrepancy.num_independent,
     )
-
-
-def _outliers(residual: Tensor, noise: float) -> tuple[int, ...]:
-    """Return the rows of outliers; their standard deviation is at least ``noise``."""
-    n = len(residual)
-    if n < MIN_PAIRS_FOR_OUTLIERS:
-        return ()
-    distance = (residual - residual.median()).abs()
-    # The median distance of a normal variable from its median is 0.6745 standard
-    # deviations.
-    std = (distance.median() / 0.6745).clamp_min(noise)
-    # The furthest of n values exceeds this quantile with a probability of 1 %. The
-    # standard deviation is an estimate, hence Student's t, by Wallace's approximation.
-    level = torch.tensor(1 - FALSE_ALARMS / (2 * n), dtype=torch.double)
-    freedom = EFFICIENCY * (n - 1)
-    score = float(torch.special.ndtri(level)) * (8 * freedom + 3) / (8 * freedom + 1)
-    furthest = math.sqrt(freedom * math.expm1(score**2 / freedom))
-    return tuple((distance > furthest * std).nonzero().flatten().tolist())

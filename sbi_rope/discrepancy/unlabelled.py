@@ -15,7 +15,6 @@ from sbi_rope.discrepancy.posterior import (
     noise_scale,
 )
 from sbi_rope.training.fit import Training, fit
-from sbi_rope.utils.errors import warn_user
 from sbi_rope.utils.seeds import seeded
 
 # Gaussians that the marginal density of simulations mixes, fitted to so many.
@@ -23,9 +22,8 @@ NUM_COMPONENTS, NUM_FITTED = 25, 8000
 # Prior standard deviations of the offset, and of the diagonal and the other entries of
 # the gain. Centre of those of the error, whose logarithms have standard deviation one.
 OFFSET, DIAGONAL, OFF_DIAGONAL, ERROR = 0.3, 0.3, 0.1, 0.3
-# The search for the mode, and how far below it the result may be, in nats.
+# The search for the mode.
 SEARCH = Training(learning_rate=3e-2, max_num_epochs=200)
-TOLERANCE = 0.1
 # Steps of Newton's method, and the distance of gradients whose difference is taken.
 NUM_HESSIANS, NUM_NEWTON, NUM_HALVINGS, STEP = 2, 5, 6, 1e-4
 
@@ -48,14 +46,13 @@ class Marginal(NamedTuple):
         return cls(*(torch.from_numpy(one).to(z_s.device) for one in found))
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class LaplaceDiscrepancy:
     """A normal approximation of the posterior of gain, offset and error."""
 
     mode: Tensor  # in standard deviations of the prior, (P,)
     root: Tensor  # of the covariance, (P, P)
     scale: Tensor  # the diagonal of D, see DiscrepancyModel, (l,)
-    below: float  # how far the log posterior is below its maximum, in nats
 
     def sample(
         self, num_draws: int, *, smallest_error: float, seed: int | None = None
@@ -67,7 +64,7 @@ class LaplaceDiscrepancy:
         gain, offset, factor = _unpacked(values, len(self.scale))
         smallest = (smallest_error * self.scale).square().diag()
         factor = torch.linalg.cholesky(factor @ factor.mT + smallest)
-        return DiscrepancyDraws(gain=gain, offset=offset, error_factor=factor)
+        return DiscrepancyDraws(gain, offset, factor)
 
 
 def fit_unlabelled(
@@ -97,9 +94,8 @@ def fit_unlabelled(
     seen = (weights > 0)[..., None]
     z = z.double().where(seen, 0.0)
     mean = moments.mean.double().where(seen, 0.0)
-    covariance = moments.covariance.double().where(
-        seen[..., None], torch.eye(width).to(z)
-    )
+    one = torch.eye(width).to(z)
+    covariance = moments.covariance.double().where(seen[..., None], one)
     share = (weights / weights.sum(dim=1, keepdim=True))[..., None, None]
     scale = noise_scale((share * covariance).sum(dim=1))
     smallest = torch.diag_embed((SMALLEST_ERROR["input"] * scale).square())
@@ -131,16 +127,8 @@ def fit_unlabelled(
             label="Discrepancy of x_o",
             show_progress_bars=show_progress_bars and unlabelled,
         )
-    mode, root, below = _polished(loss, modes.values.detach())
-    if below.max() > TOLERANCE:
-        warn_user(
-            "The discrepancy of `x_o` has not converged: its mode is about "
-            f"{float(below.max()):.2g} nats higher. Held-out scores decide about it."
-        )
-    return [
-        LaplaceDiscrepancy(mode=mode[e], root=root[e], scale=scale[e], below=float(b))
-        for e, b in enumerate(below)
-    ]
+    parts = zip(*_polished(loss, modes.values.detach()), scale, strict=True)
+    return [LaplaceDiscrepancy(*of_version) for of_version in parts]
 
 
 class _Modes(nn.Module):
@@ -151,10 +139,8 @@ class _Modes(nn.Module):
         self.values, self.num_members = nn.Parameter(values), len(values)
 
 
-def _polished(
-    loss: Callable[[Tensor], Tensor], at: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the modes, roots of the covariances, and how far below the modes we are.
+def _polished(loss: Callable[[Tensor], Tensor], at: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the modes, and roots of the covariances.
 
     Each Hessian, of differences of gradients, serves several steps of Newton's method.
     """
@@ -182,8 +168,7 @@ def _polished(
                 )
             better = (loss(at + size * move) < before)[:, None]
             at = torch.where(better, at + size * move, at)
-    white = root.mT @ gradient(at)[..., None]
-    return at, root, white.square().sum(dim=(1, 2)) / 2
+    return at, root
 
 
 def _unpacked(values: Tensor, width: int) -> tuple[Tensor, Tensor, Tensor]:

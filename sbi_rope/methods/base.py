@@ -3,11 +3,12 @@ r"""What all methods have in common: data goes in, a posterior of sbi comes out.
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from functools import partial
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
-from torch.distributions import Distribution
+from typing_extensions import Self
 
 from sbi_rope.data.pairs import Pairs
 from sbi_rope.data.simulate import Source, source_of
@@ -33,43 +34,26 @@ from sbi_rope.utils.seeds import seeded
 from sbi_rope.utils.settings import check
 from sbi_rope.utils.tensors import as_batch, column_names, rows_with
 
-if TYPE_CHECKING:
-    from typing_extensions import Self
-
 Kind = Literal["simulations", "calibration", "observations"]
-# What data are called in messages, and the call that takes them.
-DATA: dict[Kind, tuple[str, str]] = {
-    "simulations": ("simulations", "append_simulations(theta, x)"),
-    "calibration": ("calibration pairs", "append_calibration(theta, x)"),
-    "observations": ("unlabelled observations", "append_observations(x_o)"),
-}
+# The order in which a method asks for what it lacks.
+KINDS: tuple[Kind, ...] = ("observations", "calibration", "simulations")
 
 
 class Data:
-    """Simulations, calibration pairs and observations with x of the same shape.
+    """What was appended, in float32, with x of one shape."""
 
-    All are copied, in float32. Missing entries (NaN) are accepted if the embedding net
-    of a trained NPE can read them.
-    """
-
-    def __init__(self, prior: Distribution, device: torch.device) -> None:
-        self._prior = prior
-        self._device = device
-        self._tensors: dict[Kind, Any] = {}
-        self.event_shape: torch.Size | None = None
-        self.embedding_net: nn.Module = nn.Identity()
-        self.theta_names: tuple[str, ...] | None = None
-        self.x_names: tuple[str, ...] | None = None
+    def __init__(self) -> None:
+        self.tensors: dict[Kind, Any] = {}
 
     @property
     def simulations(self) -> tuple[Tensor, Tensor]:
         """Theta ``(n, d)`` and simulated x ``(n, *event)``."""
-        return self._tensors["simulations"]
+        return self.tensors["simulations"]
 
     @property
     def calibration(self) -> tuple[Tensor, Tensor]:
         """Theta ``(n, d)`` and the real x ``(n, *event)`` recorded at them."""
-        return self._tensors["calibration"]
+        return self.tensors["calibration"]
 
     @property
     def pairs(self) -> Pairs:
@@ -79,57 +63,7 @@ class Data:
     @property
     def observations(self) -> Tensor:
         """Real x without parameters, ``(n_o, *event)``."""
-        return self._tensors["observations"][0]
-
-    def count(self, kind: Kind) -> int:
-        """Return how many simulations, calibration pairs or observations there are."""
-        return len(self._tensors[kind][0]) if kind in self._tensors else 0
-
-    def append(self, kind: Kind, x: Any, theta: Any = None) -> None:
-        """Add data; simulations that cannot be read are dropped with a warning."""
-        new: tuple[Tensor, ...] = ()
-        name, rows = "x_o" if kind == "observations" else "x", None
-        if kind != "observations":
-            new, rows = (self.read_theta(theta),), len(theta)
-            check_in_support("theta", new[0], self._prior)
-        read = as_batch(
-            name, x, self.event_shape, rows=rows, names=self.x_names, finite=False
-        )
-        if read.ndim < 2:
-            raise InvalidInputError(
-                f"Expected `{name}` of shape (n, *event); got {tuple(read.shape)}. For "
-                f"one number in each row pass `{name}[:, None]`."
-            )
-        new = (*new, self._copied(read))
-        valid = self.readable(new[-1])
-        if not valid.all() and (kind != "simulations" or not valid.any()):
-            raise InvalidInputError(
-                f"Expected `{name}` to be finite; got NaN or Inf in "
-                f"{rows_with(~valid)}."
-            )
-        if not valid.all():
-            warn_user(
-                f"Dropped {int((~valid).sum())} of {len(valid)} simulations because "
-                "they contain NaN or Inf."
-            )
-            new = tuple(one[valid] for one in new)
-        old = self._tensors.get(kind, tuple(one[:0] for one in new))
-        self._tensors[kind] = tuple(map(torch.cat, zip(old, new, strict=True)))
-        self.event_shape = new[-1].shape[1:]
-        self.theta_names = self.theta_names or column_names(theta)
-        self.x_names = self.x_names or column_names(x)
-
-    def readable(self, x: Tensor) -> Tensor:
-        """Tell which x are finite, or can be read by the net in spite of NaN."""
-        return readable(self.embedding_net, x)
-
-    def read_theta(self, theta: Any) -> Tensor:
-        """Return a copy of parameters of a user, shape ``(n, d)``."""
-        shape = self._prior.event_shape
-        return self._copied(as_batch("theta", theta, shape, names=self.theta_names))
-
-    def _copied(self, tensor: Tensor) -> Tensor:
-        return tensor.to(self._device, torch.float32, copy=True)
+        return self.tensors["observations"][0]
 
 
 class Method(ABC):
@@ -199,12 +133,16 @@ class Method(ABC):
         self._prior = PriorDistribution(prior)
         self._device = torch.empty(0, device=device).device  # with its number
         self._prior.to(self._device)
-        self._data = Data(self._prior, self._device)
-        self._given_npe: Any = None
+        self._data = Data()
+        self._event_shape: torch.Size | None = None
+        self._embedding_net: nn.Module = nn.Identity()
+        self._theta_names: tuple[str, ...] | None = None
+        self._x_names: tuple[str, ...] | None = None
+        self._simulator = simulator
         self._build = estimator_builder(density_estimator)
         self._npe_training = npe_training or Training()
         self.training: Any = training or self.default_training
-        self._simulator = simulator
+        self._given_npe: Any = None
         self._posterior: Any = None
         self._history: History | None = None
 
@@ -215,7 +153,7 @@ class Method(ABC):
         *,
         simulations: tuple[Tensor, Tensor] | None = None,
         **options: Any,
-    ) -> "Self":
+    ) -> Self:
         """Start from a trained NPE instead of training one.
 
         Args:
@@ -236,15 +174,15 @@ class Method(ABC):
         estimator = estimator_of(posterior)
         method = cls(posterior.prior, device=parameter_of(estimator).device, **options)
         method._given_npe = TrainedNPE(posterior).posterior()
-        method._data.event_shape = estimator.condition_shape
-        method._data.theta_names = getattr(posterior, "parameter_names", None)
-        method._data.x_names = getattr(posterior, "x_names", None)
-        method._data.embedding_net = copy.deepcopy(embedding_of(estimator))
+        method._event_shape = estimator.condition_shape
+        method._theta_names = getattr(posterior, "parameter_names", None)
+        method._x_names = getattr(posterior, "x_names", None)
+        method._embedding_net = copy.deepcopy(embedding_of(estimator))
         if simulations is not None:
             method.append_simulations(*simulations)
         return method
 
-    def append_simulations(self, theta: Tensor, x: Tensor) -> "Self":
+    def append_simulations(self, theta: Tensor, x: Tensor) -> Self:
         """Add simulations; may be called repeatedly.
 
         Those with NaN or Inf that the embedding net cannot read are dropped.
@@ -255,7 +193,7 @@ class Method(ABC):
         """
         return self._append("simulations", x, theta)
 
-    def append_calibration(self, theta: Tensor, x: Tensor) -> "Self":
+    def append_calibration(self, theta: Tensor, x: Tensor) -> Self:
         """Add real observations with known parameters; may be called repeatedly.
 
         Args:
@@ -264,7 +202,7 @@ class Method(ABC):
         """
         return self._append("calibration", x, theta)
 
-    def append_observations(self, x_o: Tensor) -> "Self":
+    def append_observations(self, x_o: Tensor) -> Self:
         """Add real observations without labels; may be called repeatedly.
 
         Args:
@@ -274,7 +212,7 @@ class Method(ABC):
 
     def train(
         self, *, seed: int | None = None, show_progress_bars: bool | None = None
-    ) -> "Self":
+    ) -> Self:
         """Train on all data appended so far, from the start.
 
         Args:
@@ -287,11 +225,10 @@ class Method(ABC):
             NotReadyError: If data that the method needs was not appended.
         """
         self._check_data()
+        show = is_shown(show_progress_bars)
         # Whatever the caller's own setting of gradients.
         with torch.enable_grad(), seeded(seed):
-            self._posterior, self._history = self._fit(
-                show_progress_bars=is_shown(show_progress_bars)
-            )
+            self._posterior, self._history = self._fit(show_progress_bars=show)
         return self
 
     def build_posterior(self) -> Any:
@@ -303,8 +240,8 @@ class Method(ABC):
             )
         posterior = copy.deepcopy(self._posterior)
         if hasattr(posterior, "x_names"):  # those of sbi read no tables
-            posterior.parameter_names = self._data.theta_names
-            posterior.x_names = self._data.x_names
+            posterior.parameter_names = self._theta_names
+            posterior.x_names = self._x_names
         return posterior
 
     @property
@@ -350,29 +287,63 @@ class Method(ABC):
             self._prior,
             simulator=self._simulator,
             simulations=self._looked_up,
-            like=torch.empty(0, *self._data.event_shape or (), device=self._device),
-            readable=self._data.readable,
+            like=torch.empty(0, *self._event_shape or (), device=self._device),
+            readable=partial(readable, self._embedding_net),
         )
 
-    def _append(self, kind: Kind, *data: Any) -> "Self":
+    def _append(self, kind: Kind, x: Any, theta: Any = None) -> Self:
         if kind not in self.sees:
             raise InvalidInputError(
-                f"Expected a method that sees {DATA[kind][0]}; got "
-                f"{type(self).__name__}, which does not."
+                f"Expected a method that sees {kind}; got {type(self).__name__}."
             )
-        self._data.append(kind, *data)
+        new, name, rows, names = [], "x_o", None, self._x_names
+        if kind != "observations":
+            new, name, rows = [self._read_theta(theta)], "x", len(theta)
+            check_in_support("theta", new[0], self._prior)
+        read = as_batch(
+            name, x, self._event_shape, rows=rows, names=names, finite=False
+        )
+        if read.ndim < 2:
+            raise InvalidInputError(
+                f"Expected `{name}` of shape (n, *event); got {tuple(read.shape)}. For "
+                f"one number in each row pass `{name}[:, None]`."
+            )
+        new.append(read.to(self._device, torch.float32, copy=True))
+        valid = readable(self._embedding_net, new[-1])
+        if kind == "simulations" and valid.any() and not valid.all():
+            warn_user(
+                f"Dropped {int((~valid).sum())} of {len(valid)} simulations because "
+                "they contain NaN or Inf."
+            )
+        elif not valid.all():
+            raise InvalidInputError(
+                f"Expected `{name}` to be finite; got NaN or Inf in "
+                f"{rows_with(~valid)}."
+            )
+        old = self._data.tensors.get(kind, [one[:0] for one in new])
+        self._data.tensors[kind] = tuple(
+            torch.cat([one, more[valid]]) for one, more in zip(old, new, strict=True)
+        )
+        self._event_shape = read.shape[1:]
+        self._theta_names = self._theta_names or column_names(theta)
+        self._x_names = self._x_names or column_names(x)
         self._posterior = self._history = None
         return self
 
+    def _read_theta(self, theta: Any) -> Tensor:
+        """Return a copy of parameters of a user, shape ``(n, d)``."""
+        shape = self._prior.event_shape
+        read = as_batch("theta", theta, shape, names=self._theta_names)
+        return read.to(self._device, torch.float32, copy=True)
+
     def _check_data(self, *kinds: Kind) -> None:
         """Raise unless there are the data of these kinds, or of all, that it needs."""
-        for kind in kinds or tuple(reversed(DATA)):
-            what, call = DATA[kind]
-            is_needed = kind != "simulations" or self.needs_simulations
+        for kind in kinds or KINDS:
+            is_needed = self.needs_simulations if kind == "simulations" else True
             least = self.min_pairs if kind == "calibration" else 1
-            count = self._data.count(kind)
+            count = len(self._data.tensors.get(kind, [()])[0])
             if is_needed and kind in self.sees and count < least:
                 raise NotReadyError(
-                    f"{type(self).__name__} needs at least {least} {what}; got "
-                    f"{count}. Call `{call}` first."
+                    f"{type(self).__name__} needs at least {least} rows of "
+                    f"`append_{kind}(...)`; got {count}."
                 )

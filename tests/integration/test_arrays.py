@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope import RoPE
-from sbi_rope.methods import DiscrepancyNPE, FinetunedNPE
+from sbi_rope.methods import FinetunedNPE
 from sbi_rope.methods.training import Training
 from sbi_rope.metrics import draw_samples, evaluate
 from tests import gaussian, problems
@@ -58,15 +58,12 @@ def test_a_table_is_put_in_the_order_of_the_first_one() -> None:
     assert torch.equal(rope.pairs.y, torch.cat([theta, theta]))
     assert torch.equal(rope.calibration[1], torch.cat([x, x]))
     assert torch.allclose(rope.pairs.std.float(), torch.tensor([0.1, 0.2]))
-    method = DiscrepancyNPE.from_posterior(
-        gaussian.posterior(), simulator=gaussian.simulator, space="tuned", num_steps=2
-    )
-    method.append_calibration(first, x_first).train(seed=0, **QUIET)
-    tuned = method.build_posterior()
-    again = FinetunedNPE.from_posterior(tuned, training=Training(max_num_epochs=1))
-    again.append_calibration(second, x_second).train(seed=0, **QUIET)
+    options: Any = {"training": Training(max_num_epochs=1), "num_holdouts": 2}
+    method = FinetunedNPE.from_posterior(gaussian.posterior(), **options)
+    method.append_calibration(first, x_first).append_calibration(second, x_second)
+    tuned = method.train(seed=0, **QUIET).build_posterior()
     stack = stacked(rope, candidates=[PRIOR, NPE], num_folds=2)
-    for posterior in (tuned, again.build_posterior(), stack):
+    for posterior in (tuned, stack):
         expected = posterior.log_prob_batched(theta, x)
         assert torch.equal(posterior.log_prob_batched(second, x_second), expected)
         found = posterior.log_prob(second, x_second.iloc[0])  # a row is a series

@@ -143,22 +143,6 @@ def test_the_posterior_is_that_with_the_discrepancy_integrated_out(
 
 
 @pytest.mark.slow
-def test_with_many_pairs_it_becomes_the_posterior_of_a_known_discrepancy() -> None:
-    real = Reality(0.6, 0.8, 0.4)
-    theta, x = real.labelled(5000)
-    exact = real.posterior(x).log_prob(theta)[:, 0]
-    posteriors = [npe()] + [
-        corrected(real.labelled(n), model=DiscrepancyModel())[0] for n in (4, 400)
-    ]
-    plain, few, many = (
-        float((exact - log_probs(one, theta, x)).mean()) for one in posteriors
-    )
-    assert -0.005 < many < 0.02
-    assert few > 2 * many
-    assert plain > 5
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("num_pairs", [5, 50])
 def test_intervals_of_90_percent_hold_90_percent_of_the_parameters(
     num_pairs: int,

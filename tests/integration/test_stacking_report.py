@@ -251,7 +251,7 @@ def test_every_model_of_the_discrepancy_knows_the_specimens(
     monkeypatch.setattr(DiscrepancyModel, "fit", spied)
     with quick():
         data = data_of(rope)
-        assert "the 16 pairs count as " in str(data.discrepancy())
+        assert "16 calibration pairs in 8 groups" in str(data.discrepancy())
         assert len(seen) == x.shape[1]
         data.targets(torch.arange(16))
     rope.train(seed=0, show_progress_bars=False)

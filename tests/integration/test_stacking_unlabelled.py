@@ -44,7 +44,6 @@ def test_observations_without_labels_sharpen_what_six_labels_say() -> None:
     stds = []
     for some in (z_o[:0], z_o):
         [found] = fit(z, mean, some)
-        assert found.below < 1e-3
         draws = found.sample(2000, smallest_error=0.0, seed=0)
         drawn = torch.cat([draws.gain.flatten(1), draws.offset], dim=1)
         assert ((drawn.mean(dim=0) - truth).abs() < 3.5 * drawn.std(dim=0)).all()

@@ -2,7 +2,6 @@
 
 import copy
 import functools
-import math
 from typing import Any
 
 import pytest
@@ -16,7 +15,6 @@ from sbi_rope.density import MixturePosterior
 from sbi_rope.methods import DiscrepancyNPE
 from sbi_rope.tasks import get_task
 from sbi_rope.training.fit import fit, shuffled
-from sbi_rope.utils.errors import InvalidInputError
 from sbi_rope.utils.seeds import seeded
 
 pytestmark = pytest.mark.filterwarnings("ignore:Maximum number of epochs")
@@ -160,20 +158,3 @@ def test_it_can_start_from_a_corrected_npe(space: str, count: int) -> None:
     tuned = finetuned(start, num_holdouts=count)
     assert not torch.allclose(log_probs(tuned.build_posterior()), before, atol=1e-2)
     assert torch.equal(log_probs(start), before)
-
-
-@pytest.mark.medium
-def test_each_network_starts_from_one_of_the_tuned_nets() -> None:
-    start = discrepancy("tuned")
-    flow = start.posterior_estimator
-    options: Any = {"training": STILL, "learning_rates": (1e-9,)}
-    method = finetuned(start, **options)
-    of_each = networks(method)
-    expected = flow.log_probs(TEST[0][None], flow.embed(TEST[1]))[:, 0].T
-    assert torch.allclose(of_each, expected, atol=1e-3)
-    average = of_each.logsumexp(dim=1) - math.log(method.num_holdouts)
-    found = log_probs(method.build_posterior())
-    assert torch.allclose(found.double(), average, atol=1e-2)
-    assert torch.allclose(found, log_probs(start), atol=1e-2)
-    with pytest.raises(InvalidInputError, match="`num_holdouts` of 5"):
-        FinetunedNPE.from_posterior(start, num_holdouts=3)

@@ -10,8 +10,8 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from sbi_rope.discrepancy import Discrepancy, DiscrepancyModel
-from sbi_rope.discrepancy.regression import GroupErrors, Regressions, independent_pairs
+from sbi_rope.discrepancy import DiscrepancyModel
+from sbi_rope.discrepancy.posterior import Regressions, independent_pairs
 
 # Settings of the hyper-parameters k, s and the strength of the error's prior.
 SETTINGS = [(0.5, 0.2, 1.0), (3.0, 0.6, 4.0), (30.0, 0.1, 20.0)]
@@ -121,34 +121,6 @@ def test_the_shape_of_the_error_is_averaged_over_by_evidence(
         assert found.numpy() == pytest.approx(sigma, abs=1e-6)
 
 
-def test_a_precise_entry_beside_imprecise_ones_is_not_blurred() -> None:
-    """Its noise is 1/200 of its range, that of the others a quarter; no network."""
-    std = torch.tensor([1 / 200, 0.25, 0.25, 0.25]).double()
-
-    def observed(theta: Tensor) -> Tensor:
-        return 0.9 * theta + 0.1 + 1.4 * std * torch.randn(len(theta), 4)
-
-    levels = []
-    for _ in range(4):
-        theta, new = torch.randn(50, 1).double(), torch.randn(500, 1).double()
-        mean, noise = theta.expand(-1, 4), std.square().diag()
-        draws = DiscrepancyModel().fit(observed(theta), mean, noise).sample(300)
-        # Given a draw, the posterior of theta is normal, and its weight is known.
-        covariance = draws.error_factor @ draws.error_factor.mT
-        covariance = covariance + draws.gain @ noise @ draws.gain.mT
-        slope = draws.gain.sum(dim=2)
-        inverse = torch.linalg.inv(covariance + slope[:, :, None] * slope[:, None])
-        rest = (observed(new)[:, None] - draws.offset)[..., None]
-        distance = (rest.mT @ inverse @ rest)[..., 0, 0] + inverse.logdet().neg()
-        weight = torch.softmax(-distance / 2, dim=1)
-        shrunk = (slope[:, None] @ inverse)[:, 0]
-        std_of_theta = (1 - (shrunk * slope).sum(dim=1)).sqrt()
-        z = (new - (shrunk * rest[..., 0]).sum(dim=2)) / std_of_theta
-        cdf = (weight * torch.special.ndtr(z)).sum(dim=1)
-        levels.append((2 * cdf - 1).abs()[:, None])
-    assert abs(float(torch.cat(levels).mean()) - 0.5) <= 0.06
-
-
 def test_the_evidence_of_a_simulator_that_is_right_is_a_normal_density(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -190,12 +162,17 @@ def test_the_evidence_of_correlated_errors_is_a_matrix_t_density(
             + torch.special.multigammaln(torch.tensor((degrees + n) / 2), width)
             - torch.special.multigammaln(torch.tensor(degrees / 2), width)
         )
-        errors = GroupErrors(groups=groups, correlation=rho)
-        ones = torch.ones(n).double()
-        noise = no_noise(width).double()
-        regression = Regressions.of(z, mean[None], [k], ones, noise, errors=errors)
-        found = regression.log_evidence([(s, strength)])
-        assert float(found) == pytest.approx(float(expected), abs=1e-4)
+        found = Regressions.of(
+            z,
+            mean[None],
+            torch.ones(n).double(),
+            torch.tensor([k]).double(),
+            noise=no_noise(width).double(),
+            settings=torch.tensor([[s, strength]]).double(),
+            groups=groups,
+            correlation=rho,
+        )
+        assert float(found.log_evidence) == pytest.approx(float(expected), abs=1e-4)
 
 
 def std_of_offset(z: Tensor, mean: Tensor, **options: Tensor) -> float:
@@ -226,35 +203,23 @@ def test_sets_of_means_have_each_the_posterior_that_they_have_alone() -> None:
     weights = independent_pairs(groups, correlations, torch.rand(9) + 0.5)
     assert weights.shape == (4, 9)
 
-    model = DiscrepancyModel(gain_precisions=(0.1, 1.0), error_scales=(0.1, 0.4))
-    noise, once = 0.1 * torch.eye(2).double(), torch.rand(9).double()
+    def regressions(some: slice) -> Regressions:
+        return Regressions.of(
+            z,
+            means[some],
+            weights[some],
+            torch.tensor([0.1, 1.0]).double(),
+            noise=0.1 * torch.eye(2).double(),
+            settings=torch.tensor([[0.1, 1.0], [0.4, 3.0]]).double(),
+        )
 
-    def posteriors(some: slice) -> list[Discrepancy]:
-        given = {"z": z, "noise": noise, "once": once}
-        return model._conditional(means[some], weights[some], **given).posteriors()
-
-    for number, one in enumerate(posteriors(slice(None))):
-        [alone] = posteriors(slice(number, number + 1))
-        assert torch.allclose(one.shares, alone.shares)
-        assert one.num_independent == pytest.approx(float(weights[number].sum()))
-        for name in ("probability_of_none", "log_evidence", "log_evidence_of_none"):
-            assert getattr(one, name) == pytest.approx(getattr(alone, name))
-        for term, other in zip(one.terms, alone.terms, strict=True):
-            for name, part in vars(term).items():  # signs of eigenvectors may differ
-                assert torch.allclose(part.abs(), getattr(other, name).abs())
-
-
-def test_many_recordings_that_are_hardly_correlated_count_as_many_pairs() -> None:
-    groups = torch.arange(10).repeat_interleave(200)
-    for correlation in (0.0, 0.03):
-        common = correlation**0.5 * torch.randn(10, 2)[groups]
-        error = 0.3 * (common + (1 - correlation) ** 0.5 * torch.randn(2000, 2))
-        truth = 2000 / (1 + 199 * correlation)
-        # Ten specimens say little about a correlation of a few hundredths. With a grid
-        # that has none between 0 and .2, the count is too small by a factor of seven.
-        mean = torch.randn(10, 2).double()[groups]
-        found = DiscrepancyModel().fit(mean + error, mean, no_noise(2), groups=groups)
-        assert truth / 3 < found.num_independent < 3 * truth
+    together = regressions(slice(None))
+    for b in range(4):
+        alone = regressions(slice(b, b + 1))
+        assert torch.allclose(alone.log_evidence[0], together.log_evidence[b])
+        expected, found = alone.at(0, 1, 1), together.at(b, 1, 1)
+        for name, part in vars(found).items():  # signs of eigenvectors may differ
+            assert torch.allclose(part.abs(), getattr(expected, name).abs())
 
 
 def test_weights_that_differ_within_a_group_count_by_their_effective_number() -> None:
@@ -264,55 +229,6 @@ def test_weights_that_differ_within_a_group_count_by_their_effective_number() ->
     found = independent_pairs(groups, rho, weights)
     assert float(found[:2].sum()) == pytest.approx(1 / of_group)
     assert float(found[2]) == 3.0
-
-
-GRID = DiscrepancyModel(
-    gain_precisions=(1.0, 10.0),
-    error_scales=(0.2, 0.6),
-    degrees_of_freedom=(3.0, 20.0),
-)
-
-
-def from_the_prior(n: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Sigma and (A, b) from the prior of GRID by SciPy, and pairs that follow them."""
-    pick = np.random.default_rng(int(torch.randint(2**31, ())))
-    grid = GRID.gain_precisions, GRID.error_scales, GRID.degrees_of_freedom
-    k, s, strength = (float(pick.choice(values)) for values in grid)
-    scale = strength * s**2 * np.eye(width)
-    sigma = stats.invwishart.rvs(strength + width + 1, scale, random_state=pick)
-    coefficients = stats.matrix_normal.rvs(
-        np.hstack([np.eye(width), np.zeros((width, 1))]),
-        rowcov=sigma,
-        colcov=np.diag([1 / k] * width + [3 / k]),
-        random_state=pick,
-    )
-    mean = torch.randn(n, width, dtype=torch.double)
-    design = np.hstack([mean.numpy(), np.ones((n, 1))])
-    z = design @ coefficients.T + pick.multivariate_normal(np.zeros(width), sigma, n)
-    truth = torch.as_tensor(np.hstack([sigma, coefficients]))
-    return truth, torch.as_tensor(z), mean
-
-
-@pytest.mark.slow
-def test_draws_are_calibrated_over_repetitions_from_the_prior() -> None:
-    noise, ranks = 0.01 * torch.eye(2).double(), []
-
-    def compared(values: Tensor) -> Tensor:
-        """Some entries of (Sigma, A, b), and the determinant of A."""
-        det = torch.linalg.det(values[..., 2:4])[..., None]
-        return torch.cat([values[..., 0, :4], values[..., 1, 4:], det], dim=-1)
-
-    for repetition in range(300):
-        truth, z, mean = from_the_prior(8, 2)
-        discrepancy = certainly_off(GRID).fit(z, mean, noise)
-        draws = discrepancy.sample(99, smallest_error=0.0, seed=repetition)
-        total = draws.error_factor @ draws.error_factor.mT
-        total = total + draws.gain @ discrepancy.noise @ draws.gain.mT
-        drawn = torch.cat([total, draws.gain, draws.offset[..., None]], dim=2)
-        ranks.append((compared(drawn) < compared(truth)).double().mean(dim=0))
-    for column in torch.stack(ranks).T:
-        counts = torch.histc(column, bins=10, min=0.0, max=1.0).numpy()
-        assert stats.chisquare(counts).pvalue > 1e-3, counts
 
 
 def test_a_simulator_that_is_right_is_found_right_and_another_is_not() -> None:
@@ -338,7 +254,9 @@ def test_some_draws_correct_nothing() -> None:
 
 
 def test_the_noise_that_the_simulator_has_made_is_taken_off_times_the_gain() -> None:
-    fitted = certainly_off(GRID).fit(*pairs(30, 2, error=1.0), no_noise(2))
+    fitted = certainly_off(DiscrepancyModel()).fit(
+        *pairs(30, 2, error=1.0), no_noise(2)
+    )
 
     def total(noise: Tensor) -> Tensor:
         discrepancy = replace(fitted, noise=noise.double())
@@ -360,17 +278,10 @@ def test_simulations_are_corrected_by_gain_offset_and_error() -> None:
     total = (draws.error_factor @ draws.error_factor.mT).mean(dim=0) + moved.T.cov()
     assert torch.allclose(corrected.mean(dim=0), moved.mean(dim=0), atol=0.02)
     assert torch.allclose(corrected.T.cov(), total, rtol=0.05, atol=0.01)
-
-
-def test_a_draw_can_serve_a_block_of_simulations() -> None:
-    z, mean = pairs(40, 2)
-    draws = DiscrepancyModel().fit(z, mean, no_noise(2)).sample(6, seed=0)
-    draws = replace(draws, error_factor=torch.zeros_like(draws.error_factor))
-    z_s, chosen = torch.randn(12, 2).double(), torch.tensor([4, 0, 5])
-    one_by_one = draws.correct(z_s, chosen.repeat_interleave(4))
-    assert torch.allclose(draws.correct(z_s, chosen), one_by_one)
-    of_first = draws.gain[4] @ z_s[0] + draws.offset[4]
-    assert torch.allclose(one_by_one[0], of_first)
+    # A draw can serve a block of simulations.
+    draws = draws._replace(error_factor=torch.zeros_like(draws.error_factor))
+    corrected = draws.correct(z_s[:12], torch.tensor([4, 0, 5]))
+    assert torch.allclose(corrected, moved[[4, 0, 5]].repeat_interleave(4, dim=0))
 
 
 def test_draws_are_finite_for_extreme_and_degenerate_pairs() -> None:

@@ -1,6 +1,5 @@
 """NPE on corrected simulations as a method: what it takes, returns and refuses."""
 
-from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -12,17 +11,13 @@ from torch import Tensor, nn
 
 from sbi_rope.baselines import Training
 from sbi_rope.data.simulate import Moments
-from sbi_rope.density import Flow, MixturePosterior
+from sbi_rope.density import Flow
 from sbi_rope.discrepancy import DiscrepancyModel
 from sbi_rope.discrepancy.correction import correct_flow, fit_discrepancy
 from sbi_rope.methods import DiscrepancyNPE
 from sbi_rope.npe.sbi import embedding_of, estimator_of
 from sbi_rope.npe.standardisation import Standardisation
-from sbi_rope.utils.errors import (
-    InvalidInputError,
-    NotReadyError,
-    UnsupportedPosteriorError,
-)
+from sbi_rope.utils.errors import InvalidInputError, NotReadyError
 from tests import problems
 
 pytestmark = [
@@ -33,7 +28,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:Capping max_sampling_batch_size"),
 ]
 
-SPACES = ["embedding", "input", "tuned"]
+SPACES = ["embedding", "input"]
 SHORT = Training(training_batch_size=50, max_num_epochs=2)
 SMALL: dict[str, Any] = {"num_simulations": 300, "num_steps": 4}
 QUIET: dict[str, Any] = {"seed": 0, "show_progress_bars": False}
@@ -79,7 +74,6 @@ def scratch(space: str) -> DiscrepancyNPE:
 @pytest.mark.filterwarnings("error::sbi_rope.utils.errors.RoPEWarning")
 @pytest.mark.parametrize("space", SPACES)
 def test_every_source_of_simulations_gives_a_posterior_of_sbi(space: str) -> None:
-    expected = MixturePosterior if space == "tuned" else DirectPosterior
     x, stored = labelled(4)[1], simulations()
     for name, made in {
         "simulator": method(space=space),
@@ -89,14 +83,14 @@ def test_every_source_of_simulations_gives_a_posterior_of_sbi(space: str) -> Non
     }.items():
         made.append_calibration(*labelled()).train(**QUIET)
         posterior = made.build_posterior()
-        assert isinstance(posterior, expected), name
+        assert isinstance(posterior, DirectPosterior), name
         samples = posterior.sample_batched((7,), x, show_progress_bars=False)
         assert samples.shape == (7, 4, 2), name
         assert problems.box(2).support.check(samples).all(), name
         found = log_probs(posterior, x)
         assert found.isfinite().all(), name
         assert len(made.history.training_loss) >= 4, name
-        assert made.discrepancy.num_pairs == 12, name
+        assert made.discrepancy.num_independent == 12, name
         assert not torch.equal(found, log_probs(problems.npe_posterior(), x)), name
     with pytest.raises(NotReadyError, match=r"Call `train\(\)` first"):
         _ = made.append_calibration(*labelled()).discrepancy
@@ -115,8 +109,6 @@ def test_vector_fields_are_corrected_and_can_be_sampled() -> None:
             samples.append(one.sample((5,), x=x, show_progress_bars=False))
         assert samples[0].shape == (5, 2)
         assert not torch.equal(*samples)
-        with pytest.raises(UnsupportedPosteriorError, match="space='tuned'"):
-            trained(posterior, space="tuned")
 
 
 @pytest.mark.medium
@@ -140,22 +132,6 @@ def test_correcting_an_embedding_leaves_its_net_and_correcting_x_does_not() -> N
         after = estimator_of(trained(space=space, num_steps=20).build_posterior())
         embedded = [embedding_of(e).eval()(x) for e in (before, after)]
         assert torch.equal(*embedded) is same, space
-
-
-@pytest.mark.slow
-def test_learned_parameters_move_the_posterior_to_those_of_the_pairs() -> None:
-    theta = problems.box(2).sample((2000,))
-    theta = theta[theta[:, 0] > 0.5][:100]
-    x = problems.simulate(theta) + 3 * torch.randn(100, 3)  # hardly informative
-    means = []
-    for learn_prior in (False, True):
-        options = {"num_steps": 1000, "num_simulations": 2000}
-        made = method(learn_prior=learn_prior, **options)
-        posterior = made.append_calibration(theta, x).train(**QUIET).build_posterior()
-        samples = posterior.sample_batched((50,), x[:20], show_progress_bars=False)
-        means.append(float(samples[..., 0].mean()))
-    assert means[0] < 0.3
-    assert 0.6 < means[1] < 0.9
 
 
 @pytest.mark.parametrize("space", ["embedding", "input"])
@@ -217,8 +193,6 @@ def test_only_simulations_with_a_probability_are_drawn() -> None:
 
 def test_pairs_that_cannot_be_corrected_are_refused() -> None:
     theta, x = labelled()
-    with pytest.raises(InvalidInputError, match="all 12 have the same"):
-        method(space="tuned").append_calibration(theta[:1].expand(12, 2), x).train()
     flat = method(simulator=lambda theta: torch.ones(len(theta), 3), space="input")
     with pytest.raises(InvalidInputError, match="simulations that differ"):
         flat.append_calibration(theta, x).train(**QUIET)
@@ -227,32 +201,3 @@ def test_pairs_that_cannot_be_corrected_are_refused() -> None:
     images.append_calibration(theta, problems.simulate_image(theta))
     with pytest.raises(InvalidInputError, match="Use space='embedding'"):
         images.train(**QUIET)
-
-
-class Remembering(nn.Module):
-    """Tells of each observation whether it has been tuned on it."""
-
-    def __init__(self, x: Tensor) -> None:
-        super().__init__()
-        self.known = x
-
-    def forward(self, x: Tensor) -> Tensor:
-        same = (x[:, None] == self.known).all(dim=-1)
-        return same.any(dim=1, keepdim=True).float()
-
-
-def test_pairs_are_embedded_by_a_net_that_was_tuned_on_all_others() -> None:
-    made = method(space="tuned").append_calibration(*labelled())
-    seen: list[Tensor] = []
-
-    def tuned(h: Any, x: Tensor, targets: Any, sets: Any, **options: Any) -> Any:
-        seen.extend(sets)
-        nets = [Remembering(x[rows]) for rows in sets]
-        return SimpleNamespace(member=nets.__getitem__), []
-
-    with patch("sbi_rope.methods.discrepancy_npe.TUNING", SimpleNamespace(tuned=tuned)):
-        _, z = made._cross_fitted(
-            nn.Identity(), torch.ones(12, 1), simulations()[1], show_progress_bars=False
-        )
-    assert (z == 0).all()
-    assert [len(rows) for rows in seen] == [9, 9, 10, 10, 10]

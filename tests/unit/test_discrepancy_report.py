@@ -11,7 +11,6 @@ from sbi_rope.data.simulate import Moments
 from sbi_rope.discrepancy import DiscrepancyModel, DiscrepancyReport, Interval
 from sbi_rope.discrepancy.report import report_discrepancy
 from sbi_rope.methods import DiscrepancyNPE
-from sbi_rope.tasks import get_task
 from sbi_rope.utils.errors import InvalidInputError, NotReadyError
 from tests import problems
 
@@ -76,9 +75,6 @@ def test_a_planted_discrepancy_is_found_in_units_of_x_and_no_other() -> None:
     clean = next(line for line in text.split("\n") if "no sign of discrep" in line)
     assert set(clean.split(": ")[1].split(", ")) == {"light", "heat", "dust"}
     assert found.notes == []
-    rows = found.as_rows()
-    assert [row["summary"] for row in rows] == [s.name for s in found.summaries]
-    assert rows[0]["shift_low"] == shade.shift.low
 
 
 @pytest.mark.slow
@@ -173,7 +169,7 @@ def test_a_method_reports_without_training() -> None:
         assert [s.name for s in found.summaries if s.is_off] == ["b"]
         assert inside(0.7, found["b"].shift)
         again = asked.report(x_names=["a", "b", "c"], show_progress_bars=False)
-        assert again.as_rows() == found.as_rows()
+        assert again == found
 
 
 def test_recordings_of_a_person_do_not_make_intervals_narrower() -> None:
@@ -191,10 +187,6 @@ def test_recordings_of_a_person_do_not_make_intervals_narrower() -> None:
     # As independent pairs, they would be narrower by a factor of 1.7.
     assert widths[1] / widths[0] == pytest.approx(1.0, abs=0.2)
     assert "What 60 calibration pairs in 20 groups say about" in str(found)
-    # The error of the person is several times as large as that of the recording.
-    numbers = [summary.num_independent for summary in found.summaries]
-    assert all(20 <= number < 30 for number in numbers)
-    assert "the 60 pairs count as 21 independent ones" in str(found)
 
 
 def test_a_report_asks_for_the_data_that_it_lacks() -> None:
@@ -230,18 +222,4 @@ def test_the_discrepancy_of_an_image_is_that_of_its_summaries() -> None:
         assert [s.name for s in found.summaries if s.is_off] == ["NE"]
         assert inside(0.5, found["NE"].shift)
         arrays = asked.report(summaries=lambda x: blocks(x).numpy(), x_names=names)
-        assert arrays.as_rows() == found.as_rows()
-
-
-@pytest.mark.medium
-def test_the_published_law_of_the_light_tunnel_over_predicts_all_light(
-    chamber_root: Any,
-) -> None:
-    task = get_task("light_tunnel_sensors", root=chamber_root)
-    asked = DiscrepancyNPE(task.get_prior(), simulator=task.get_simulator())
-    asked.append_calibration(*task.get_calibration_set(20))
-    found = asked.report(x_names=task.x_names, show_progress_bars=False)
-    off = {summary.name for summary in found.summaries if summary.is_off}
-    assert off == {f"log_{kind}_{i}" for kind in ("ir", "vis") for i in (1, 2, 3)}
-    assert all(found[name].shift.high < 0 for name in off)  # in log units
-    assert "no sign of discrepancy: current" in str(found)
+        assert arrays == found

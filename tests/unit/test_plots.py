@@ -236,7 +236,6 @@ def test_discrepancy_draws_a_row_with_intervals_for_each_summary() -> None:
         error=Interval(low=0.0, median=1.0, high=2.0),
         size=Interval(low=0.25, median=0.5, high=0.875),
         std=400.0,
-        num_independent=7.0,
         probability_of_none=0.01,
     )
     small = Interval(low=0.001, median=0.0015, high=0.002)

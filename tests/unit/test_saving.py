@@ -94,7 +94,7 @@ assert not [name for name in sys.modules if name.split(".")[0] == "tests"]
 @pytest.mark.medium
 def test_another_process_loads_the_same_posteriors(tmp_path: Path) -> None:
     batch, stack = rope_posterior(), small_stack()
-    tuned = trained("discrepancy_tuned", "linear_gaussian").build_posterior()
+    tuned = trained("finetuned_npe_averaged", "linear_gaussian").build_posterior()
     x_o = stacks.observed()
     cases = [
         (batch, x_o[:5]),
