@@ -151,7 +151,6 @@ def _coupled(rope: RoPE, case: Case, cell: Cell) -> Any:
         case.test_set[1],
         coupler=coupler,
         seed=case.seed,
-        require_convergence=False,
         show_progress_bars=False,
     )
 

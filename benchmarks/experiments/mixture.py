@@ -127,7 +127,6 @@ def measure(settings: dict[str, Any]) -> None:
         ),
         num_simulations=settings["n_s"],
         seed=0,
-        unseen="extend",
     )
     ess = posterior.coupling.effective_sample_size.median()
     cell: dict[str, float] = {"ess": round(float(ess)), "memory_start": round(memory())}
@@ -141,7 +140,7 @@ def measure(settings: dict[str, Any]) -> None:
     cell["memory_samples"] = round(peak_memory())
     cell["total"] = round(cell["log_prob"] + cell["samples"], 2)
 
-    new = iter(1.1 * simulate(npe.prior.sample((3 * settings["num_single"],))) + 0.1)
+    new = itertools.cycle(x_o)
     net = rope.embedding_net
     calls: dict[str, Callable[[Tensor], Tensor]] = {
         "row": lambda x: posterior.coupling.rows(net(x[None])),

@@ -94,7 +94,7 @@ def diagnose(
     check("rope", rope, RoPE)
     check("posterior", posterior, MixturePosterior | None)
     check("num_folds", num_folds, Folds | None)
-    x_o = rope.checked_observations(x_o)  # before anybody waits for a training
+    x_o = rope.npe.as_x("x_o", x_o)  # before anybody waits for a training
     pairs, tuned = rope.pairs, len(rope.pairs) > 0
     if tuned and not rope.is_trained:
         rope = copy.copy(rope)  # which shares all data
@@ -110,10 +110,10 @@ def diagnose(
                 f"thresholds; got {len(batch.theta)}."
             )
         dim = batch.theta.shape[1]
-        names = rope.parameter_names or default_names(dim)
+        names = rope.npe.parameter_names or default_names(dim)
         if parameter_names is not None:
             names = names_of(parameter_names, dim)
-        npe, real, simulated = batch.npe, _moved(batch.real), _moved(batch.simulated)
+        npe, real, simulated = rope.npe, _moved(batch.real), _moved(batch.simulated)
         simulations = Simulations(_moved(batch.theta), simulated, tuned)
         embedded = npe.embed("x_o", batch.x_o, npe.h)
         before = mmd_test(_moved(embedded), simulated, null=simulated)
@@ -141,10 +141,11 @@ def diagnose(
             if far.value is None:  # so that a single broken observation is found
                 findings.append(unmatched(distance, len(simulated)))
         else:
+            coupling = rope.coupler.couple(batch.real, batch.simulated)
             findings += [
                 after_tuning(after, before),
                 unmatched(distance, len(simulated)),
-                effective_sizes(batch.couple(rope.coupler), len(simulated)),
+                effective_sizes(coupling, len(simulated)),
                 residual_finding(pairs, held_out, simulations),
             ]
         # So many that a histogram is smooth.

@@ -1,17 +1,18 @@
 """Test whether the residuals of calibration pairs depend on their parameters."""
 
+from functools import partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from sbi_rope.data.pairs import Pairs, one_of_each_group, without_warning_of_few_pairs
+from sbi_rope.data.simulate import targets
 from sbi_rope.diagnosis.report import Finding
 from sbi_rope.diagnosis.simulations import Simulations
 from sbi_rope.metrics.statistics import LEVEL, permutation_test
 from sbi_rope.npe.sbi import embed
 from sbi_rope.rope.rope import RoPE
-from sbi_rope.utils.progress import progress_bar
 from sbi_rope.utils.tensors import divisors
 
 NAME = "residual depends on parameters"
@@ -50,29 +51,37 @@ def cross_fit(rope: RoPE, *, num_folds: int, show_progress_bars: bool) -> HeldOu
     by :meth:`RoPE.train`: residuals from averages that are also given x would be too
     small, as they would be of pairs that g was trained on.
     """
-    pairs, h = rope.pairs, rope.embedding_net
-    targets = rope.draw_targets(
-        rope.finetuner.simulations_per_target, show_progress_bars=False
+    pairs, h, finetuner = rope.pairs, rope.npe.h, rope.finetuner
+    of_pairs = targets(
+        rope.source,
+        pairs,
+        finetuner.simulations_per_target,
+        partial(embed, h),
+        num_neighbors=finetuner.num_neighbors,
     )
-    embedded = torch.empty_like(targets)
     # Recordings of one person share a fold, as they do in a stack.
     folds = pairs.folds(num_folds)
-    for held_out in progress_bar(folds, show=show_progress_bars, desc="Folds"):
-        others = torch.cat([fold for fold in folds if fold is not held_out])
-        with without_warning_of_few_pairs():
-            result = rope.finetuner.finetune(
-                h,
-                pairs.x[others],
-                lambda count, others=others: targets[others],
-                draw_simulations=lambda n: rope.source.from_prior(n, seed=0)[1],
-                groups=pairs.group[others],
-                weights=pairs.weight[others],
-                show_progress_bars=False,
-            )
-        embedded[held_out] = embed(result.embedding_net, pairs.x[held_out])
+    others = [
+        torch.cat([fold for fold in folds if fold is not held_out])
+        for held_out in folds
+    ]
+    with without_warning_of_few_pairs():
+        nets, _ = finetuner.tuned(
+            h,
+            pairs.x,
+            [of_pairs] * len(folds),
+            others,
+            groups=pairs.group,
+            weights=pairs.weight,
+            draw_simulations=lambda n: rope.source.from_prior(n, seed=0)[1],
+            show_progress_bars=show_progress_bars,
+        )
+    embedded = torch.empty_like(of_pairs)
+    for number, held_out in enumerate(folds):
+        embedded[held_out] = embed(nets.member(number), pairs.x[held_out])
     return HeldOut(
         embedded=embedded.cpu().double(),
-        targets=targets.cpu().double(),
+        targets=of_pairs.cpu().double(),
         group=pairs.group.cpu(),
     )
 

@@ -512,7 +512,7 @@ class UnlabelledCandidate(CorrectingCandidate):
 
     def check(self, data: StackData) -> None:
         """Raise for observations of another shape, and those that are not finite."""
-        as_batch("x_o", data.rope.checked_observations(self.x_o))
+        as_batch("x_o", data.rope.npe.as_x("x_o", self.x_o))
         super().check(data)
 
     def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
@@ -568,7 +568,7 @@ def default_candidates(
     if rope is None:
         return _all_candidates(x_o, learn_prior=learn_prior)
     check("rope", rope, RoPE)
-    x_o = None if x_o is None else rope.checked_observations(x_o)
+    x_o = None if x_o is None else rope.npe.as_x("x_o", x_o)
     data = StackData(rope, num_folds=NUM_FOLDS, seed=0, show_progress_bars=False)
     return _suitable_candidates(data, x_o, learn_prior=learn_prior)
 

@@ -113,7 +113,7 @@ def score_folds(
             log_unit=_log_unit(data),
             weight=weight,
             group=pairs.group if pairs.num_groups < len(pairs) else None,
-            parameter_names=data.rope.parameter_names,
+            parameter_names=data.npe.parameter_names,
         ),
         set_scores=_set_scores(data, of_stack, fold, weights, seed=seed),
         score_errors=None if pairs.are_exact else of_stack.errors,

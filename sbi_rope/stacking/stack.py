@@ -96,9 +96,9 @@ def stack(
     check("rope", rope, RoPE)
     check("num_folds", num_folds, Annotated[int, Range(2)])
     check("learning_curve", learning_curve, bool)
-    start, calls = time.perf_counter(), rope.num_simulator_calls
+    start, calls = time.perf_counter(), rope.source.num_calls
     if x_o is not None:
-        x_o = rope.checked_observations(x_o)
+        x_o = rope.npe.as_x("x_o", x_o)
         warn_of_far_entries("x_o", x_o, rope.embedding_net)
     of_data, of_scores = draw_seeds(seed, 2)
     data = StackData(
@@ -161,7 +161,7 @@ def stack(
             "seconds": f"{time.perf_counter() - start:.0f}",
             "longest": ", ".join(f"{name} {seconds[name]:.0f} s" for name in slowest),
             **({"left out": left_out(stacked, x_o)} if candidates is None else {}),
-            "simulator calls": f"{rope.num_simulator_calls - calls:,}",
+            "simulator calls": f"{rope.source.num_calls - calls:,}",
             "finished": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
             "versions": ", ".join(f"{name} {version(name)}" for name in PACKAGES),
         },
@@ -172,7 +172,8 @@ def stack(
         report=report,
         enable_transform=data.npe.enable_transform,
     )
-    posterior.parameter_names, posterior.x_names = rope.parameter_names, rope.x_names
+    npe = rope.npe
+    posterior.parameter_names, posterior.x_names = npe.parameter_names, npe.x_names
     return posterior
 
 
@@ -185,7 +186,7 @@ def _compare_batch(data: StackData, x_o: Tensor) -> TwoSampleTest | None:
     density = headless(data.estimator)
     test = compare_with_pairs(real, data.pairs.group.cpu(), batch, density)
     if test is not None and test.is_different:
-        names = data.rope.parameter_names or default_names(data.pairs.theta.shape[-1])
+        names = data.npe.parameter_names or default_names(data.pairs.theta.shape[-1])
         where = ", ".join(test.parameters(names)) or "no parameter alone"
         warn_user(
             f"`x_o` differs from the observations of the calibration pairs (p = "

@@ -42,7 +42,7 @@ def rope(pairs: Any) -> RoPE:
 def test_pairs_and_observations_are_those_of_tensors(convert: Any) -> None:
     theta_o, x_o = map(convert, OBSERVED)
     given = rope(map(convert, PAIRS))
-    for ours, tensor in zip(given.calibration, PAIRS, strict=True):
+    for ours, tensor in zip((given.pairs.mean, given.pairs.x), PAIRS, strict=True):
         assert ours.dtype == torch.float32
         assert torch.equal(ours, tensor)
     given.train(seed=0, **QUIET)
@@ -73,7 +73,7 @@ def test_a_table_is_put_in_the_order_of_the_first_one() -> None:
     rope.append_calibration(first, x_first, theta_std=noise)
     rope.append_calibration(second, x_second, theta_std=noise.iloc[0])
     assert torch.equal(rope.pairs.label.y, torch.cat([theta, theta]))
-    assert torch.equal(rope.calibration[1], torch.cat([x, x]))
+    assert torch.equal(rope.pairs.x, torch.cat([x, x]))
     variance = rope.pairs.label.covariance.diagonal(dim1=1, dim2=2)
     assert torch.allclose(variance.sqrt().float(), torch.tensor([0.1, 0.2]))
     method = DiscrepancyNPE.from_posterior(

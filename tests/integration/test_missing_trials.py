@@ -46,7 +46,7 @@ def test_rope_repairs_a_posterior_of_trials_some_of_which_are_missing() -> None:
     trained = rope().train(seed=0, **QUIET)
     assert torch.isfinite(torch.tensor(trained.history.training_loss)).all()
     posterior = trained.build_posterior(x_o, num_simulations=60, seed=0, **QUIET)
-    assert trained.num_dropped_simulations == 0
+    assert trained.source.num_dropped == 0
     assert is_finite(posterior, theta_o, x_o)
     # The observation is known again by its values, those missing included.
     alone = posterior[3]
@@ -107,7 +107,7 @@ def test_a_net_that_counts_the_trials_of_another_row_is_refused() -> None:
     rope.append_calibration(theta, x.nan_to_num(0.5))
     for call in (
         lambda: rope.append_calibration(theta, x),
-        lambda: rope.checked_observations(x),
+        lambda: rope.npe.as_x("x_o", x),
         lambda: evaluate(npe, theta, x),
         lambda: FinetunedNPE.from_posterior(npe).append_calibration(theta, x),
     ):

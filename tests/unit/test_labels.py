@@ -314,7 +314,7 @@ def test_exact_and_noisy_labels_may_be_appended_one_after_the_other() -> None:
     conductor = rope().append_calibration(theta[:4], x[:4])
     conductor.append_calibration(theta[4:], x[4:], theta_std=0.3)
     assert str(conductor.pairs) == "6 labels, 2 with noise and 0 partial"
-    known, _ = conductor.calibration
+    known = conductor.pairs.mean
     assert torch.allclose(known[:4], theta[:4])
     # The posterior mean of a noisy label is nearer to the mean of the prior.
     assert torch.allclose(known[4:], theta[4:] / 1.09, atol=0.1)

@@ -16,7 +16,6 @@ from sbi_rope import (
 )
 from sbi_rope.data.simulate import Stored
 from sbi_rope.utils.errors import (
-    CouplingError,
     InvalidInputError,
     NotReadyError,
     RoPEWarning,
@@ -164,15 +163,6 @@ def test_the_nearest_parameters_are_found_in_units_of_their_standard_deviations(
     assert Stored(wide, x).near(theta, 1, lambda x: x).tolist() == [[[1.0, 0.0]]]
 
 
-def test_a_coupling_that_has_not_converged_is_an_error_unless_it_is_accepted() -> None:
-    rough = SinkhornCoupler(gamma=0.01, max_iterations=1)
-    conductor = rope(coupler=rough)
-    with pytest.raises(CouplingError, match=r"not converged.*require_convergence"):
-        conductor.build_posterior(X_O)
-    posterior = conductor.build_posterior(X_O, require_convergence=False)
-    assert not posterior.coupling.converged
-
-
 THETA, X = torch.zeros(10, 2), torch.zeros(10, 2)
 
 
@@ -212,18 +202,3 @@ def test_stored_parameters_that_are_no_draws_of_the_prior_are_warned_of() -> Non
     theta[:, 1] *= 0.5
     with pytest.warns(RoPEWarning, match=r"parameters \[1\] .* not distributed like"):
         RoPE(gaussian.posterior(), simulations=(theta, gaussian.simulator(theta)))
-
-
-def test_labels_that_do_not_follow_the_prior_are_warned_of_once_with_tau_1() -> None:
-    theta = gaussian.prior().sample((40,))
-    for scale in (1.0, 0.2):
-        rope = RoPE(gaussian.posterior(), simulator=gaussian.simulator, finetuner=QUICK)
-        rope.append_calibration(scale * theta, gaussian.simulator(scale * theta))
-        rope.train(seed=0, show_progress_bars=False)
-        found = []
-        for tau in (0.9, 1.0, 1.0):
-            with warnings.catch_warnings(record=True) as caught:
-                warnings.simplefilter("always")
-                rope.build_posterior(X_O, coupler=SinkhornCoupler(gamma=0.5, tau=tau))
-            found.append(any("distributed like the" in str(w.message) for w in caught))
-        assert found == [False, scale < 1, False]

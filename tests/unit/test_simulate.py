@@ -228,15 +228,15 @@ def test_calls_of_the_simulator_are_counted_from_the_first_on() -> None:
     for function in (gaussian.simulator, fails_in_batches):
         count, rows = counted(function)
         rope = RoPE(gaussian.posterior(), simulator=count)
-        assert 0 < rope.num_simulator_calls == sum(rows) < 40
+        assert 0 < rope.source.num_calls == sum(rows) < 40
         rope.embed(x, num_simulations=30)
-        assert rope.num_simulator_calls == sum(rows)
+        assert rope.source.num_calls == sum(rows)
     rope = RoPE(gaussian.posterior(), simulator=gaussian.simulator, finetuner=QUICK)
-    tried = rope.num_simulator_calls
+    tried = rope.source.num_calls
     rope.append_calibration(theta, x).train()
-    assert rope.num_simulator_calls == tried + 1000
+    assert rope.source.num_calls == tried + 1000
     rope.build_posterior(x)
-    assert rope.num_simulator_calls == tried + 2000
+    assert rope.source.num_calls == tried + 2000
 
 
 @pytest.mark.filterwarnings("ignore::sbi_rope.utils.errors.RoPEWarning")
@@ -249,7 +249,7 @@ def test_a_budget_is_simulated_once_and_then_used_as_stored_simulations_are() ->
     tried = sum(rows)
     rope.append_calibration(theta, x).train(seed=0)
     found = rope.build_posterior(x, seed=0, num_simulations=1200)
-    assert sum(rows) == rope.num_simulator_calls == tried + 1200
+    assert sum(rows) == rope.source.num_calls == tried + 1200
     stored = RoPE(
         gaussian.posterior(),
         simulations=rope.source.from_prior(1200),
@@ -259,7 +259,7 @@ def test_a_budget_is_simulated_once_and_then_used_as_stored_simulations_are() ->
     expected = stored.build_posterior(x, seed=0, num_simulations=1200)
     assert torch.allclose(found.weights.sort().values, expected.weights.sort().values)
     assert rope.build_posterior(x).weights.shape == (10, 1000)
-    assert stored.num_simulator_calls == 0
+    assert stored.source.num_calls == 0
     assert rope.build_posterior(x, num_simulations=1201).weights.shape == (10, 1200)
     with pytest.raises(InvalidInputError, match="`num_simulations` with a simulator"):
         RoPE(gaussian.posterior(), simulations=(theta, x), num_simulations=10)
@@ -276,21 +276,20 @@ def test_simulations_that_were_interrupted_go_on_where_they_were() -> None:
         calls.append(theta)
         return theta + torch.randn(2)
 
-    def rope() -> RoPE:
-        made = RoPE(gaussian.posterior(), simulator=one, num_simulations=350)
-        return made.append_calibration(*pairs)
+    def source() -> Source:
+        rope = RoPE(gaussian.posterior(), simulator=one, num_simulations=350)
+        return rope.source
 
-    pairs = gaussian.labelled(5)
-    undisturbed = rope().draw_targets(1)
-    interrupted = rope()
+    undisturbed = source().from_prior(350, seed=0)[1]
+    interrupted = source()
     # Within the third part, which has ten simulations.
     broken.append(len(calls) + 25)
     with pytest.raises(KeyboardInterrupt):
-        interrupted.draw_targets(1)
+        interrupted.from_prior(350, seed=0)
     broken.clear()
     before = len(calls)
     for _ in range(2):
-        assert torch.equal(interrupted.draw_targets(1), undisturbed)
+        assert torch.equal(interrupted.from_prior(350, seed=0)[1], undisturbed)
         assert len(calls) - before == 350 - 20
 
 
