@@ -101,21 +101,21 @@ def diagnose(
         rope.train(seed=seed, show_progress_bars=show_progress_bars)
     with seeded(seed):
         # First, so that a posterior with the same seed has these simulations.
-        batch = rope.embed(
+        x_o, real, theta, simulated = rope.embed(
             x_o, num_simulations=num_simulations, show_progress_bars=show_progress_bars
         )
-        if len(batch.theta) < FEWEST_SIMULATIONS:
+        if len(theta) < FEWEST_SIMULATIONS:
             raise InvalidInputError(
                 f"Expected at least {FEWEST_SIMULATIONS} simulations, to estimate the "
-                f"thresholds; got {len(batch.theta)}."
+                f"thresholds; got {len(theta)}."
             )
-        dim = batch.theta.shape[1]
+        dim = theta.shape[1]
         names = rope.npe.parameter_names or default_names(dim)
         if parameter_names is not None:
             names = names_of(parameter_names, dim)
-        npe, real, simulated = rope.npe, _moved(batch.real), _moved(batch.simulated)
-        simulations = Simulations(_moved(batch.theta), simulated, tuned)
-        embedded = npe.embed("x_o", batch.x_o, npe.h)
+        npe, real, simulated = rope.npe, _moved(real), _moved(simulated)
+        simulations = Simulations(_moved(theta), simulated, tuned)
+        embedded = npe.embed("x_o", x_o, npe.h)
         before = mmd_test(_moved(embedded), simulated, null=simulated)
         like_pairs = after = held_out = None
         if tuned:
@@ -130,7 +130,7 @@ def diagnose(
         learned: tuple[str, ...] = ()
         if like_pairs and not like_pairs.is_different and _has_learned(posterior):
             learned = like_pairs.alike(names)
-        far = far_entries(npe.h, batch.x_o)
+        far = far_entries(npe.h, x_o)
         findings = [
             unlike_pairs(like_pairs, names),
             far,
@@ -141,7 +141,7 @@ def diagnose(
             if far.value is None:  # so that a single broken observation is found
                 findings.append(unmatched(distance, len(simulated)))
         else:
-            coupling = rope.coupler.couple(batch.real, batch.simulated)
+            coupling = rope.coupler.couple(real, simulated)
             findings += [
                 after_tuning(after, before),
                 unmatched(distance, len(simulated)),

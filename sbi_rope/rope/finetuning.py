@@ -41,9 +41,8 @@ class CalibrationFinetuner(Settings):
 
     With ``rehearsal`` :math:`\lambda > 0` it also minimises, over simulations from the
     prior, :math:`\lambda\, \mathbb{E} \lVert g(x_s) - h(x_s) \rVert_2`, which is not in
-    the paper, so that g does not forget how h embeds simulations. It helps if a large
-    net is tuned on few pairs (``docs/background/benchmark.md``). The loss on the
-    held-out pairs does not contain it.
+    the paper. It helps if a large net is tuned on few pairs. The loss on the held-out
+    pairs does not contain it.
 
     The net is tuned in evaluation mode (no dropout, fixed batch statistics). If h has
     no trainable parameters, because NPE was trained without an embedding net, g is h

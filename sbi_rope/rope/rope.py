@@ -3,7 +3,7 @@
 import copy
 from collections.abc import Callable, Hashable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -43,23 +43,6 @@ from sbi_rope.utils.tensors import (
 MIN_SIMULATIONS = 1000
 
 
-class EmbeddedBatch(NamedTuple):
-    r"""Real observations and simulations, and their embeddings.
-
-    Attributes:
-        x_o: The observations, shape ``(n_o, *event)``.
-        real: Their embeddings :math:`g(x_o)`, or :math:`h(x_o)` if nothing was tuned,
-            shape ``(n_o, l)``.
-        theta: The parameters of the simulations, shape ``(n_s, d)``.
-        simulated: The embeddings :math:`h(x_s)` of the simulations, shape ``(n_s, l)``.
-    """
-
-    x_o: Tensor
-    real: Tensor
-    theta: Tensor
-    simulated: Tensor
-
-
 class RoPE:
     r"""Repairs a trained sbi posterior with a few labelled real observations.
 
@@ -85,20 +68,16 @@ class RoPE:
         posterior: What ``NPE(...).build_posterior()`` returns, or the posterior of
             MNPE, FMPE or NPSE (these two without ``log_prob``), trained in one round.
         simulator: Maps parameters ``(n, d)`` to simulations ``(n, *event)``, or one
-            ``(d,)`` to one ``(*event)``. It may take tensors or NumPy arrays (of
-            float64), and return either, lists, or numbers. A row of x may depend on the
-            same row of theta only, with noise from the global generator of torch, NumPy
-            or Python. Simulations that the embedding net cannot read (NaN or Inf), and
-            those for which the simulator raises, are dropped and counted.
+            ``(d,)`` to one ``(*event)``; tensors or NumPy arrays. A row of x may depend
+            on the same row of theta only, with noise from the global generator of
+            torch, NumPy or Python. Simulations that the embedding net cannot read (NaN
+            or Inf), and those for which the simulator raises, are dropped and counted.
             :func:`~sbi_rope.parallel` calls it in several processes.
         simulations: Instead of a simulator, stored pairs (theta, x) with theta drawn
             from the prior. There is a warning if theta is distributed otherwise.
         num_simulations: For a slow simulator, the number of simulations in all. They
             are made from the prior when they are first needed, and then used like
-            stored ones. If None, a few are made when RoPE is constructed, 100 for each
-            label by :meth:`train` (and 2000 with rehearsal), ``max(n_o, 1000)`` for
-            each batch by :meth:`build_posterior`, and by :func:`~sbi_rope.stack` 10,000
-            from the prior and 100 for each label.
+            stored ones. ``docs/howto/simulators.md`` says how many are made if None.
         finetuner: Settings of step 1; ``CalibrationFinetuner()`` if None.
         coupler: Settings of step 2; ``SinkhornCoupler()`` if None.
         parameter_names: One name for each parameter. If None, the columns of the first
@@ -130,8 +109,7 @@ class RoPE:
         >>> theta_cal, theta_o = prior.sample((10,)), prior.sample((30,))
         >>> x_cal, x_o = simulator(theta_cal) + 0.3, simulator(theta_o) + 0.3
         >>> rope = RoPE(npe.build_posterior(), simulator=simulator)
-        >>> rope = rope.append_calibration(theta_cal, x_cal)
-        >>> rope = rope.train(show_progress_bars=False)
+        >>> rope = rope.append_calibration(theta_cal, x_cal).train()
         >>> posterior = rope.build_posterior(x_o)
         >>> posterior.sample_batched((5,), x=x_o, show_progress_bars=False).shape
         torch.Size([5, 30, 1])
@@ -172,7 +150,7 @@ class RoPE:
         x = self.npe.like.new_empty(0, *self.npe.event_shape)
         self.pairs = Pairs.exact(self.npe.like, x)
         self._names: tuple[Hashable, ...] = ()
-        self._embed_simulations = partial(embed, self.npe.h)
+        self._embed = partial(embed, self.npe.h)
         self._g: nn.Module | None = None
         self._history: History | None = None
 
@@ -219,8 +197,6 @@ class RoPE:
         Raises:
             InvalidInputError: If an exact theta is outside the prior's support, or no
                 parameters inside it fit a label. Nothing is added then.
-            UnsupportedPosteriorError: If labels are not exact and some parameters are
-                discrete.
         """
         names = self.npe.parameter_names or column_names(theta)
         label = given_labels(
@@ -302,22 +278,19 @@ class RoPE:
             raise NotReadyError(
                 "No calibration pairs; call `append_calibration(theta, x)` first."
             )
-        pairs, h, show = self.pairs, self.npe.h, is_shown(show_progress_bars)
-        source, of_simulations = self.source, self._embed_simulations
-        count = self.finetuner.simulations_per_target
+        pairs, show = self.pairs, is_shown(show_progress_bars)
+        source, how, h = self.source, self.finetuner, self._embed
 
         def draw_targets() -> Tensor:
+            of_pairs = source, pairs, how.simulations_per_target, h
             if pairs.are_exact:
-                num_neighbors = self.finetuner.num_neighbors
-                options = {"num_neighbors": num_neighbors, "progress": show}
-                return targets(source, pairs, count, of_simulations, **options)
-            _, simulated = source.from_prior(
-                MIN_SIMULATIONS, of_simulations, seed=0, progress=show
-            )
+                neighbors = how.num_neighbors
+                return targets(*of_pairs, num_neighbors=neighbors, progress=show)
+            _, z_s = source.from_prior(MIN_SIMULATIONS, h, seed=0, progress=show)
             return tuning_targets(
-                embed(h, pairs.x),
-                moments(source, pairs, count, of_simulations, progress=show),
-                Standardisation(simulated.double()),
+                h(pairs.x),
+                moments(*of_pairs, progress=show),
+                Standardisation(z_s.double()),
                 weights=pairs.weight,
                 groups=pairs.group,
             )
@@ -326,15 +299,15 @@ class RoPE:
             return source.from_prior(n, seed=0, progress=show)[1]
 
         with seeded(seed):
-            nets, [self._history] = self.finetuner.tuned(
-                h,
+            nets, [self._history] = how.tuned(
+                self.npe.h,
                 pairs.x,
                 [draw_targets()],
                 [torch.arange(len(pairs)).to(pairs.group)],
                 groups=pairs.group,
                 weights=pairs.weight,
                 draw_simulations=draw_simulations,
-                draw_targets=draw_targets if self.finetuner.resample_targets else None,
+                draw_targets=draw_targets if how.resample_targets else None,
                 show_progress_bars=show,
             )
         self._g = nets.member(0)
@@ -347,8 +320,8 @@ class RoPE:
         num_simulations: int | None = None,
         seed: int | None = None,
         show_progress_bars: bool | None = None,
-    ) -> EmbeddedBatch:
-        """Return the embeddings of real observations and of simulations.
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return x_o, g(x_o), parameters of simulations theta, and h(x_s).
 
         The arguments are those of :meth:`build_posterior`. With the same
         ``num_simulations`` and ``seed``, it couples with the same simulations.
@@ -364,10 +337,10 @@ class RoPE:
         with seeded(seed):
             theta, simulated = self.source.from_prior(
                 num_simulations or max(len(x_o), MIN_SIMULATIONS),
-                self._embed_simulations,
+                self._embed,
                 progress=is_shown(show_progress_bars),
             )
-        return EmbeddedBatch(x_o, real, theta, simulated)
+        return x_o, real, theta, simulated
 
     def build_posterior(
         self,

@@ -102,7 +102,7 @@ def of_posterior(kind: str, make: Callable[[], Any]) -> dict[str, Call]:
 
 def with_simulations(theta: Tensor = THETA_S, x: Tensor = X_S) -> Tensor:
     rope = RoPE(npe(), simulations=(theta, x))
-    return rope.embed(X_O, seed=0).simulated
+    return rope.embed(X_O, seed=0)[3]
 
 
 CALLS: dict[str, Call] = {
