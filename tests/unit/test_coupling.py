@@ -1,6 +1,5 @@
 """The coupling against a slow log-domain solver, its limits and failures."""
 
-import functools
 import itertools
 import warnings
 from typing import Any
@@ -47,32 +46,23 @@ def worst_total_variation(a: Tensor, b: Tensor) -> float:
     return float((a.double() - b.double()).abs().sum(dim=1).max() / 2)
 
 
-@functools.cache
-def solved_by_the_oracle(
-    ratio: float, tau: float
-) -> tuple[Tensor, Tensor, float, Tensor, float]:
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        real, simulated = clouds()
-    cost = cost_of(real, simulated)
-    gamma = ratio * float(cost.max())
-    # It converges within 1500, or not at all in time.
-    plan = oracles.semi_balanced_plan(cost, gamma=gamma, tau=tau, iterations=1500)
-    return real, simulated, gamma, *plan
-
-
 @pytest.mark.medium
-@pytest.mark.parametrize("mode", MODES)
-def test_rows_equal_those_of_the_oracle(mode: str) -> None:
+def test_rows_equal_those_of_the_oracle() -> None:
+    real, simulated = clouds()
+    cost = cost_of(real, simulated)
     for ratio, tau in ((1.0, 1.0), (0.1, 0.9), (1e-2, 0.5), (1e-3, 0.9)):
-        real, simulated, gamma, expected, change = solved_by_the_oracle(ratio, tau)
-        settings = {"gamma": gamma, "tau": tau, "max_iterations": 600}
-        coupling = coupled(mode, real, simulated, tolerance=1e-10, **settings)
-        assert (coupling.weights.sum(dim=1) - 1).abs().max() < 1e-12
-        assert coupling.converged, (ratio, tau)
+        gamma = ratio * float(cost.max())
+        # It converges within 1500, or not at all in time.
+        oracle = {"gamma": gamma, "tau": tau, "iterations": 1500}
+        expected, change = oracles.semi_balanced_plan(cost, **oracle)
         assert change < 1e-10
-        distance = worst_total_variation(coupling.weights, expected)
-        assert distance < 1e-6, (ratio, tau)
+        settings = {"gamma": gamma, "tau": tau, "max_iterations": 600}
+        for mode in MODES:
+            coupling = coupled(mode, real, simulated, tolerance=1e-10, **settings)
+            assert (coupling.weights.sum(dim=1) - 1).abs().max() < 1e-12
+            assert coupling.converged, (mode, ratio, tau)
+            distance = worst_total_variation(coupling.weights, expected)
+            assert distance < 1e-6, (mode, ratio, tau)
 
 
 def test_the_plan_minimises_the_objective_of_the_paper() -> None:
@@ -136,18 +126,14 @@ def test_rows_of_any_portion_are_the_weights_and_new_rows_are_near_a_refit() -> 
     assert worst_total_variation(coupling.rows(new), refit) < 0.01
 
 
-def test_effective_sample_size_counts_equal_weights(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_effective_sample_size_counts_equal_weights() -> None:
     # The first observation is near two of four simulations, the second far from all.
     simulated = torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 50.0], [0.0, -50.0]])
     real = torch.tensor([[0.0, 0.0], [1e6, 0.0]])
     coupling = raw_coupler(gamma=1.0, tau=0.0).couple(real, simulated)
-    expected = 1 / coupling.weights.square().sum(dim=1)
-    monkeypatch.setattr(sinkhorn, "BLOCK", 4)
     sizes = coupling.effective_sample_size
     assert sizes[0] == pytest.approx(2.0)
-    assert torch.allclose(sizes, expected)
+    assert torch.allclose(sizes, 1 / coupling.weights.square().sum(dim=1))
 
 
 def test_columns_that_underflow_are_as_in_the_log_domain() -> None:
@@ -227,11 +213,10 @@ def test_it_converges_with_far_points_on_both_sides() -> None:
 @pytest.mark.parametrize("mode", MODES)
 def test_a_gpu_gives_the_rows_of_the_cpu(mode: str) -> None:
     real, simulated = clouds(300, 200, 5)
-    for gamma, tau in ((0.5, 0.9), (0.1, 1.0)):
-        settings = {"gamma": gamma, "tau": tau, "tolerance": 1e-9}
-        expected = coupled(mode, real, simulated, **settings)
-        coupling = coupled(mode, real.cuda(), simulated.cuda(), **settings)
-        assert coupling.potential.is_cuda
-        assert coupling.converged
-        difference = worst_total_variation(coupling.weights.cpu(), expected.weights)
-        assert difference < 1e-6, (gamma, tau)
+    settings = {"gamma": 0.1, "tau": 0.9, "tolerance": 1e-9}
+    expected = coupled(mode, real, simulated, **settings)
+    coupling = coupled(mode, real.cuda(), simulated.cuda(), **settings)
+    assert coupling.potential.is_cuda
+    assert coupling.converged
+    difference = worst_total_variation(coupling.weights.cpu(), expected.weights)
+    assert difference < 1e-6
