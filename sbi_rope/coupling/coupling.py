@@ -33,8 +33,7 @@ class Coupling:
 
     .. math:: \alpha_{ij} = \operatorname{softmax}_j (w_j - C_{ij} / \gamma).
 
-    The coupling keeps :math:`w` and the embeddings, and computes rows when they are
-    asked for.
+    Rows are computed when they are asked for.
 
     Attributes:
         potential: :math:`w`, shape ``(n_s,)``, float64, with mean zero.

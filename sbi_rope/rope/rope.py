@@ -164,7 +164,7 @@ class RoPE:
         weights: Tensor | None = None,
         groups: Tensor | Sequence[int | str] | None = None,
     ) -> "RoPE":
-        r"""Add real observations with known parameters to those appended so far.
+        r"""Add real observations with known parameters; return this object.
 
         Labels need not be exact. A label is then a measurement
         :math:`y \sim \mathcal N(\theta, R)` of some or all of the parameters.
@@ -190,9 +190,6 @@ class RoPE:
             groups: A number or a name for each pair. Pairs of one group are recordings
                 of one person or specimen. They are held out together, and count once
                 in scores. If None, pairs with equal labels are a group.
-
-        Returns:
-            Itself, so that calls can be chained.
 
         Raises:
             InvalidInputError: If an exact theta is outside the prior's support, or no
@@ -259,7 +256,7 @@ class RoPE:
     def train(
         self, *, seed: int | None = None, show_progress_bars: bool | None = None
     ) -> "RoPE":
-        """Tune the embedding net on all calibration pairs appended so far.
+        """Tune the embedding net on all calibration pairs; return this object.
 
         Every call starts from the embedding net of NPE. Where labels are not exact,
         targets are averages given the label and x, under a discrepancy model of the
@@ -270,9 +267,6 @@ class RoPE:
                 and Python; None uses their states.
             show_progress_bars: Whether to show the progress of simulations and losses.
                 None does so in a terminal or a notebook, but not in a file.
-
-        Returns:
-            Itself, so that calls can be chained.
         """
         if not len(self.pairs):
             raise NotReadyError(
