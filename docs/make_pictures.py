@@ -155,9 +155,9 @@ def gammas(rope: RoPE, theta: Tensor, x_o: Tensor) -> "Figure":
     """Draw posteriors of one observation at several gammas."""
     values = (1.0, 0.1, 0.02)
     samples = {}
-    batch = rope.embed(x_o, seed=0, **QUIET)
     for gamma in values:
-        posterior = batch.posterior(batch.couple(SinkhornCoupler(gamma=gamma)))
+        coupler = SinkhornCoupler(gamma=gamma)
+        posterior = rope.build_posterior(x_o, coupler=coupler, seed=0, **QUIET)
         draws = posterior[OBSERVED].sample((2000,), **QUIET)
         samples[f"gamma {gamma:g}"] = draws[:, SHOWN]
     return plots.pair_plot(samples, theta[SHOWN], parameter_names=NAMES)

@@ -206,10 +206,6 @@ class TableCoupling(Coupling):
 
     table: Tensor = field(repr=False)
 
-    @property
-    def weights(self) -> Tensor:
-        return self.rows(self.real)
-
     def rows(self, real: Tensor) -> Tensor:
         rows = super().rows(real)
         known = (real[:, None] == self.real).all(dim=-1).any(dim=1)
@@ -232,7 +228,6 @@ def coupling_of(weights: Tensor, simulated: Tensor) -> TableCoupling:
         marginal_error=0.0,
         num_iterations=0,
         converged=True,
-        solver="none",
     )
 
 

@@ -72,9 +72,6 @@ class OTOnly(Method):
         prior, density_estimator, npe_training, simulator, device: See :class:`Method`.
         coupler: Settings of the transport; ``SinkhornCoupler()`` if None.
         num_simulations: n_s; as many as there are observations, at least 1000, if None.
-
-    Raises:
-        CouplingError: In ``train``, if the transport has not converged.
     """
 
     sees = frozenset({"simulations", "observations"})

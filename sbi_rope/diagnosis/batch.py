@@ -92,28 +92,28 @@ def diagnose(
     check("rope", rope, RoPE)
     check("posterior", posterior, MixturePosterior | None)
     check("num_folds", num_folds, Folds | None)
-    x_o = rope.checked_observations(x_o)  # before anybody waits for a training
+    x_o = rope.npe.as_x("x_o", x_o)  # before anybody waits for a training
     pairs, tuned = rope.pairs, len(rope.pairs) > 0
     if tuned and not rope.is_trained:
         rope = copy.copy(rope)  # which shares all data
         rope.train(seed=seed, show_progress_bars=show_progress_bars)
     with seeded(seed):
         # First, so that a posterior with the same seed has these simulations.
-        batch = rope.embed(
+        x_o, real, theta, simulated = rope.embed(
             x_o, num_simulations=num_simulations, show_progress_bars=show_progress_bars
         )
-        n_s, dim = batch.theta.shape
+        n_s, dim = theta.shape
         if n_s < FEWEST_SIMULATIONS:
             raise InvalidInputError(
                 f"Expected at least {FEWEST_SIMULATIONS} simulations, to estimate the "
                 f"thresholds; got {n_s}."
             )
-        names = rope.parameter_names or default_names(dim)
+        names = rope.npe.parameter_names or default_names(dim)
         if parameter_names is not None:
             names = names_of(parameter_names, dim)
-        npe, real, simulated = batch.npe, _moved(batch.real), _moved(batch.simulated)
-        simulations = Simulations(_moved(batch.theta), simulated, tuned)
-        embedded = npe.embed("x_o", batch.x_o, npe.h)
+        npe, real, simulated = rope.npe, _moved(real), _moved(simulated)
+        embedded = npe.embed("x_o", x_o, npe.h)
+        simulations = Simulations(_moved(theta), simulated, tuned)
         before = mmd_test(_moved(embedded), simulated, simulated)
         like_pairs = after = held_out = None
         if tuned:
@@ -124,7 +124,7 @@ def diagnose(
         if num_folds is not None and pairs.num_groups > 1:
             held_out = cross_fit(rope, num_folds, show=is_shown(show_progress_bars))
         shift = prior_shift(real, simulations, held_out)
-        far, near = far_entries(npe.h, batch.x_o), unmatched(distance, n_s)
+        far, near = far_entries(npe.h, x_o), unmatched(distance, n_s)
         findings = [
             unlike_pairs(like_pairs, names),
             far,
@@ -132,10 +132,11 @@ def diagnose(
             before_tuning(before, tuned=tuned),
         ]
         if not hasattr(posterior, "report"):
+            coupling = rope.coupler.couple(real, simulated)
             findings += [
                 after_tuning(after),
                 near,
-                effective_sizes(batch.couple(rope.coupler), n_s),
+                effective_sizes(coupling, n_s),
             ]
         elif far.value is None:  # a stack, of which a broken observation must be found
             findings.append(near)

@@ -2,7 +2,7 @@
 
 from collections.abc import Container, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import torch
@@ -10,11 +10,11 @@ from torch import Tensor
 
 from sbi_rope.coupling import Coupling, SinkhornCoupler
 from sbi_rope.data.pairs import group_means, without_warning_of_few_pairs
+from sbi_rope.data.simulate import targets
 from sbi_rope.diagnosis.report import Finding
 from sbi_rope.metrics.statistics import LEVEL
 from sbi_rope.npe.sbi import embed
 from sbi_rope.rope.rope import RoPE
-from sbi_rope.utils.progress import progress_bar
 from sbi_rope.utils.tensors import divisors
 
 # At tau = 0 each observation is coupled by itself, without trust in the prior. The
@@ -101,25 +101,32 @@ class HeldOut(NamedTuple):
 
 def cross_fit(rope: RoPE, num_folds: int, *, show: bool) -> HeldOut:
     """Embed each calibration pair by a g that was trained on the other folds."""
-    pairs, count = rope.pairs, rope.finetuner.simulations_per_target
-    targets = rope.draw_targets(count, show_progress_bars=False)
-    embedded = torch.empty_like(targets)
+    pairs, h, finetuner = rope.pairs, rope.npe.h, rope.finetuner
+    of_pairs = targets(
+        rope.source,
+        pairs,
+        finetuner.simulations_per_target,
+        partial(embed, h),
+        num_neighbors=finetuner.num_neighbors,
+    )
     # Recordings of one person share a fold, as they do in a stack.
     folds = pairs.folds(num_folds)
-    for held_out in progress_bar(folds, show=show, desc="Folds"):
-        others = torch.cat([fold for fold in folds if fold is not held_out])
-        with without_warning_of_few_pairs():
-            result = rope.finetuner.finetune(
-                rope.embedding_net,
-                pairs.x[others],
-                lambda count, others=others: targets[others],
-                draw_simulations=lambda n: rope.source.from_prior(n, seed=0)[1],
-                groups=pairs.group[others],
-                weights=pairs.weight[others],
-                show_progress_bars=False,
-            )
-        embedded[held_out] = embed(result.embedding_net, pairs.x[held_out])
-    moved = (values.cpu().double() for values in (embedded, targets))
+    others = [torch.cat([*folds[:k], *folds[k + 1 :]]) for k in range(len(folds))]
+    with without_warning_of_few_pairs():
+        nets, _ = finetuner.tuned(
+            h,
+            pairs.x,
+            [of_pairs] * len(folds),
+            others,
+            groups=pairs.group,
+            weights=pairs.weight,
+            draw_simulations=lambda n: rope.source.from_prior(n, seed=0)[1],
+            show_progress_bars=show,
+        )
+    embedded = torch.empty_like(of_pairs)
+    for number, held_out in enumerate(folds):
+        embedded[held_out] = embed(nets.member(number), pairs.x[held_out])
+    moved = (values.cpu().double() for values in (embedded, of_pairs))
     return HeldOut(*moved, group=pairs.group.cpu())
 
 

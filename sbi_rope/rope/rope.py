@@ -1,18 +1,17 @@
 """Robust posterior estimation: the class that runs its three steps."""
 
 import copy
-import itertools
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from sbi_rope.coupling import Coupling, SinkhornCoupler
+from sbi_rope.coupling import SinkhornCoupler
 from sbi_rope.data.labels import draws_of, given_groups, given_labels, given_weights
 from sbi_rope.data.pairs import Pairs, effective_number, groups_of
-from sbi_rope.data.parameters import is_improbable, probability_of_prior
 from sbi_rope.data.simulate import Source, moments, source_of, targets
 from sbi_rope.density import Coupled, MixturePosterior
 from sbi_rope.discrepancy.correction import tuning_targets
@@ -20,7 +19,6 @@ from sbi_rope.npe.sbi import TrainedNPE, embed
 from sbi_rope.npe.standardisation import Standardisation, warn_of_far_entries
 from sbi_rope.rope.finetuning import CalibrationFinetuner, History
 from sbi_rope.utils.errors import (
-    CouplingError,
     InvalidInputError,
     NotReadyError,
     UnsupportedPosteriorError,
@@ -37,47 +35,6 @@ from sbi_rope.utils.tensors import (
 
 # The number of simulations to couple with if the batch has fewer observations.
 MIN_SIMULATIONS = 1000
-
-
-@dataclass(frozen=True, eq=False)
-class EmbeddedBatch:
-    r"""The embeddings of real observations and of simulations, which can be coupled.
-
-    Attributes:
-        x_o: The observations, shape ``(n_o, *event)``.
-        real: Their embeddings :math:`g(x_o)`, shape ``(n_o, l)``.
-        theta: The parameters of the simulations, shape ``(n_s, d)``.
-        simulated: The embeddings :math:`h(x_s)` of the simulations, shape ``(n_s, l)``.
-        npe: The NPE that the embeddings belong to.
-        embedding_net: g, or h if nothing was tuned.
-    """
-
-    x_o: Tensor
-    real: Tensor
-    theta: Tensor
-    simulated: Tensor
-    npe: TrainedNPE
-    embedding_net: nn.Module
-
-    def couple(self, coupler: SinkhornCoupler) -> Coupling:
-        """Couple the observations with the simulations."""
-        return coupler.couple(self.real, self.simulated)
-
-    def posterior(
-        self, coupling: Coupling, *, unseen: Literal["raise", "extend"] = "raise"
-    ) -> MixturePosterior:
-        """Return the mixture of simulated posteriors that a coupling gives."""
-        # Copies, so that moving one posterior to a device leaves the others where they
-        # are.
-        net, npe = copy.deepcopy(self.embedding_net), self.npe
-        density = Coupled(
-            npe.density(), self.simulated, self.x_o, net, coupling, unseen=unseen
-        )
-        posterior = MixturePosterior(
-            density, npe.prior, enable_transform=npe.enable_transform
-        )
-        posterior.parameter_names, posterior.x_names = npe.parameter_names, npe.x_names
-        return posterior
 
 
 class RoPE:
@@ -105,25 +62,28 @@ class RoPE:
         posterior: What ``NPE(...).build_posterior()`` returns, or the posterior of
             MNPE, FMPE or NPSE (these two without ``log_prob``), trained in one round.
         simulator: Maps parameters ``(n, d)`` to simulations ``(n, *event)``, or one
-            ``(d,)`` to one ``(*event)``. It may take tensors or NumPy arrays (of
-            float64), and return either, lists, or numbers. A row of x may depend on the
-            same row of theta only, with noise from the global generator of torch, NumPy
-            or Python. Simulations that the embedding net cannot read (NaN or Inf), and
-            those for which the simulator raises, are dropped and counted.
+            ``(d,)`` to one ``(*event)``; tensors or NumPy arrays. A row of x may depend
+            on the same row of theta only, with noise from the global generator of
+            torch, NumPy or Python. Simulations that the embedding net cannot read (NaN
+            or Inf), and those for which the simulator raises, are dropped and counted.
             :func:`~sbi_rope.parallel` calls it in several processes.
         simulations: Instead of a simulator, stored pairs (theta, x) with theta drawn
             from the prior. There is a warning if theta is distributed otherwise.
         num_simulations: For a slow simulator, the number of simulations in all. They
             are made from the prior when they are first needed, and then used like
-            stored ones. If None, see :attr:`num_simulator_calls`.
+            stored ones. ``docs/howto/simulators.md`` says how many are made if None.
         finetuner: Settings of step 1; ``CalibrationFinetuner()`` if None.
         coupler: Settings of step 2; ``SinkhornCoupler()`` if None.
         parameter_names: One name for each parameter. If None, the columns of the first
             table of parameters, or "theta_1" and so on.
 
     Attributes:
+        npe: A copy of the posterior, in its parts; ``npe.posterior()`` puts them
+            together again.
         pairs: The calibration pairs appended so far, with draws of their parameters.
-        source: Where simulations come from.
+        source: Where simulations come from; ``source.num_calls`` counts how many rows
+            of theta the simulator has simulated, and ``source.num_dropped`` those that
+            were dropped because of NaN or Inf.
 
     Raises:
         UnsupportedPosteriorError: If the posterior has no embedding to work with, or if
@@ -143,8 +103,7 @@ class RoPE:
         >>> theta_cal, theta_o = prior.sample((10,)), prior.sample((30,))
         >>> x_cal, x_o = simulator(theta_cal) + 0.3, simulator(theta_o) + 0.3
         >>> rope = RoPE(npe.build_posterior(), simulator=simulator)
-        >>> rope = rope.append_calibration(theta_cal, x_cal)
-        >>> rope = rope.train(show_progress_bars=False)
+        >>> rope = rope.append_calibration(theta_cal, x_cal).train()
         >>> posterior = rope.build_posterior(x_o)
         >>> posterior.sample_batched((5,), x=x_o, show_progress_bars=False).shape
         torch.Size([5, 30, 1])
@@ -171,21 +130,21 @@ class RoPE:
             x_names = column_names(x)
             parameter_names = parameter_names or column_names(theta)
             simulations = (as_numbers("theta", theta, names=parameter_names), x)
-        self._npe = TrainedNPE(posterior, parameter_names)
-        self._npe.x_names = x_names
-        x_like = self._npe.like.new_empty(0, *self._npe.event_shape)
+        self.npe = TrainedNPE(posterior, parameter_names)
+        self.npe.x_names = x_names
+        x_like = self.npe.like.new_empty(0, *self.npe.event_shape)
         self.source: Source = source_of(
-            self._npe.prior,
+            self.npe.prior,
             simulator=simulator,
             simulations=simulations,
             num_simulations=num_simulations,
             like=x_like,
-            readable=self._npe.readable,
+            readable=self.npe.readable,
         )
-        self.pairs = Pairs.exact(self._npe.like, x_like)
+        self.pairs = Pairs.exact(self.npe.like, x_like)
         self._names: tuple[Hashable, ...] = ()
+        self._embed = partial(embed, self.npe.h)
         self._g: nn.Module | None = None
-        self._prior_is_compared = False
         self._history: History | None = None
 
     def append_calibration(
@@ -197,16 +156,16 @@ class RoPE:
         weights: Tensor | None = None,
         groups: Tensor | Sequence[int | str] | None = None,
     ) -> "RoPE":
-        r"""Add real observations with known parameters to those appended so far.
+        r"""Add real observations with known parameters; return this object.
 
         Labels need not be exact. A label is then a measurement
         :math:`y_j \sim \mathcal N(\theta_j, \sigma_j^2)` of some or all parameters.
         Whatever needs the parameters is averaged over :math:`p(\theta \mid y)` under
         the prior.
 
-        Tensors, arrays, tables and lists of numbers are taken, as wherever you pass
-        data. The columns of a table are put into the order of the names that RoPE
-        knows. Rows of theta and x are paired by position, not by their row labels.
+        Tensors, arrays, tables and lists of numbers are taken. The columns of a table
+        are put into the order of the names that RoPE knows. Rows of theta and x are
+        paired by position, not by their row labels.
 
         Args:
             theta: Parameters, shape ``(n, d)``, inside the prior's support. NaN stands
@@ -222,50 +181,39 @@ class RoPE:
                 of one person or specimen. They are held out together, and count once
                 in scores. If None, pairs with equal labels are a group.
 
-        Returns:
-            Itself, so that calls can be chained.
-
         Raises:
             InvalidInputError: If an exact theta is outside the prior's support, or no
                 parameters inside it fit a label. Nothing is added then.
-            UnsupportedPosteriorError: If labels are not exact and some parameters are
-                discrete.
         """
-        names = self.parameter_names or column_names(theta)
+        names = self.npe.parameter_names or column_names(theta)
         draws, y, std = given_labels(
-            theta, theta_std, like=self._npe.like, prior=self._npe.prior, names=names
+            theta, theta_std, like=self.npe.like, prior=self.npe.prior, names=names
         )
         weight = given_weights(weights, len(y), y.device)
         of_rows = given_groups(groups, len(y))
-        x_names = self.x_names or column_names(x)
-        x = self._npe.as_x("x", x, rows=len(y))
+        x_names = self.npe.x_names or column_names(x)
+        x = self.npe.as_x("x", x, rows=len(y))
         rows = torch.arange(len(y), device=y.device)
         new = Pairs(theta=draws, x=x, group=rows, weight=weight, y=y, std=std)
-        if self._npe.is_mixed and not new.are_exact:
+        if self.npe.is_mixed and not new.are_exact:
             raise UnsupportedPosteriorError(
                 "Expected exact labels, because some parameters are discrete (MNPE); "
                 "got others."
             )
-        self._npe.embed("x", x, self._npe.h)
-        warn_of_far_entries("x", x, self._npe.h)
-        known = ~torch.isnan(y).all(dim=1)
-        if not known.any():
+        self.npe.embed("x", x, self.npe.h)
+        warn_of_far_entries("x", x, self.npe.h)
+        if (unknown := torch.isnan(y).all(dim=1)).any():
             raise InvalidInputError(
-                "Expected labels of at least one parameter in one pair; got NaN only."
+                "Expected labels of at least one parameter in each pair; got NaN only "
+                f"in {rows_with(unknown)}."
             )
-        if not known.all():
-            warn_user(
-                "Labels that say nothing about any parameter are left out: "
-                f"{rows_with(~known)}."
-            )
-            new, of_rows = new[known], tuple(itertools.compress(of_rows, known))
         if len(self.pairs) and bool(self._names) != bool(of_rows):
             raise InvalidInputError(
                 "Expected `groups` of all calibration pairs, or of none; got some."
             )
         pairs, of_rows = self.pairs + new, self._names + of_rows
         group = groups_of(of_rows).to(y.device) if of_rows else pairs.label
-        theta = draws_of(pairs, self._npe.prior)
+        theta = draws_of(pairs, self.npe.prior)
         pairs = replace(pairs, theta=theta, group=group)
         total = float(pairs.weight.sum())
         if total < effective_number(pairs.weight) / 2:
@@ -274,15 +222,14 @@ class RoPE:
                 "together count as so many pairs; do not normalise them."
             )
         self.pairs, self._names = pairs, of_rows
-        self._npe.parameter_names, self._npe.x_names = names, x_names
+        self.npe.parameter_names, self.npe.x_names = names, x_names
         self._g, self._history = None, None
-        self._prior_is_compared = False
         return self
 
     def train(
         self, *, seed: int | None = None, show_progress_bars: bool | None = None
     ) -> "RoPE":
-        """Tune the embedding net on all calibration pairs appended so far.
+        """Tune the embedding net on all calibration pairs; return this object.
 
         Every call starts from the embedding net of NPE. Where labels are not exact,
         targets are averages given the label and x, under a discrepancy model of the
@@ -293,71 +240,45 @@ class RoPE:
                 and Python; None uses their states.
             show_progress_bars: Whether to show the progress of simulations and losses.
                 None does so in a terminal or a notebook, but not in a file.
-
-        Returns:
-            Itself, so that calls can be chained.
         """
         if not len(self.pairs):
             raise NotReadyError(
                 "No calibration pairs; call `append_calibration(theta, x)` first."
             )
-        show, pairs = is_shown(show_progress_bars), self.pairs
+        pairs, show = self.pairs, is_shown(show_progress_bars)
+        source, how, h = self.source, self.finetuner, self._embed
 
-        def drawn(count: int) -> Tensor:
+        def draw_targets() -> Tensor:
+            of_pairs = source, pairs, how.simulations_per_target, h
             if pairs.are_exact:
-                return self.draw_targets(count, show_progress_bars=show)
-            simulated = self._simulations(MIN_SIMULATIONS, progress=show)
+                neighbors = how.num_neighbors
+                return targets(*of_pairs, num_neighbors=neighbors, progress=show)
+            _, x_s = source.from_prior(MIN_SIMULATIONS, seed=0, progress=show)
             return tuning_targets(
-                embed(self._npe.h, pairs.x),
-                moments(
-                    self.source,
-                    pairs,
-                    self.finetuner.simulations_per_target,
-                    self._embed_simulations,
-                    progress=show,
-                ),
-                Standardisation(self._embed_simulations(simulated).double()),
+                h(pairs.x),
+                moments(*of_pairs, progress=show),
+                Standardisation(h(x_s).double()),
                 weights=pairs.weight,
                 groups=pairs.group,
             )
 
-        result = self.finetuner.finetune(
-            self._npe.h,
-            pairs.x,
-            drawn,
-            draw_simulations=lambda count: self._simulations(count, progress=show),
-            groups=pairs.group,
-            weights=pairs.weight,
-            seed=seed,
-            show_progress_bars=show,
-        )
-        self._g, self._history = result.embedding_net, result.history
+        def draw_simulations(n: int) -> Tensor:
+            return source.from_prior(n, seed=0, progress=show)[1]
+
+        with seeded(seed):
+            nets, [self._history] = how.tuned(
+                self.npe.h,
+                pairs.x,
+                [draw_targets()],
+                [torch.arange(len(pairs)).to(pairs.group)],
+                groups=pairs.group,
+                weights=pairs.weight,
+                draw_simulations=draw_simulations,
+                draw_targets=draw_targets if how.resample_targets else None,
+                show_progress_bars=show,
+            )
+        self._g = nets.member(0)
         return self
-
-    def draw_targets(
-        self, simulations_per_target: int, *, show_progress_bars: bool | None = None
-    ) -> Tensor:
-        r"""Return the targets of the tuning, the mean embeddings of simulations.
-
-        Args:
-            simulations_per_target: The number of simulations for each pair.
-            show_progress_bars: As in :meth:`train`.
-
-        Returns:
-            :math:`E[h(S(\theta)) \mid y_i]`, shape ``(n_c, l)``.
-        """
-        return targets(
-            self.source,
-            self.pairs,
-            simulations_per_target,
-            self._embed_simulations,
-            num_neighbors=self.finetuner.num_neighbors,
-            progress=is_shown(show_progress_bars),
-        )
-
-    def _simulations(self, count: int, *, progress: bool) -> Tensor:
-        """Return up to ``count`` simulations from the prior, always the same."""
-        return self.source.from_prior(count, seed=0, progress=progress)[1]
 
     def embed(
         self,
@@ -366,8 +287,8 @@ class RoPE:
         num_simulations: int | None = None,
         seed: int | None = None,
         show_progress_bars: bool | None = None,
-    ) -> EmbeddedBatch:
-        r"""Return the embeddings of real observations and of simulations.
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return x_o, g(x_o), parameters of simulations theta, and h(x_s).
 
         The arguments are those of :meth:`build_posterior`. With the same
         ``num_simulations`` and ``seed``, it couples with the same simulations.
@@ -377,17 +298,15 @@ class RoPE:
                 f"{len(self.pairs)} calibration pairs were appended; call `train()` "
                 "first."
             )
-        net = self._npe.h if self._g is None else self._g
-        x_o = self._npe.as_x("x_o", x_o)
-        real = self._npe.embed("x_o", x_o, net)
         check("num_simulations", num_simulations, Count | None)
+        x_o = self.npe.as_x("x_o", x_o)
+        real = self.npe.embed("x_o", x_o, self._net)
         with seeded(seed):
             theta, simulated = self.source.from_prior(
                 num_simulations or max(len(x_o), MIN_SIMULATIONS),
                 progress=is_shown(show_progress_bars),
             )
-        simulated = self._embed_simulations(simulated)
-        return EmbeddedBatch(x_o, real, theta, simulated, self._npe, net)
+        return x_o, real, theta, self._embed(simulated)
 
     def build_posterior(
         self,
@@ -396,8 +315,6 @@ class RoPE:
         coupler: SinkhornCoupler | None = None,
         num_simulations: int | None = None,
         seed: int | None = None,
-        unseen: Literal["raise", "extend"] = "raise",
-        require_convergence: bool = True,
         show_progress_bars: bool | None = None,
     ) -> MixturePosterior:
         """Couple a batch of real observations with simulations.
@@ -411,87 +328,51 @@ class RoPE:
             num_simulations: n_s; ``max(n_o, 1000)`` if None. Of stored simulations
                 there may be fewer.
             seed: Seed of the simulations, as in :meth:`train`.
-            unseen: What the posterior does with an x outside the batch: ``"raise"`` an
-                error, or ``"extend"`` the coupling by one row.
-            require_convergence: Whether a coupling that has not converged is an error.
             show_progress_bars: As in :meth:`train`.
 
         Returns:
-            The posteriors of the batch.
+            The posteriors of the batch. There is a warning if the coupling has not
+            converged.
 
         Raises:
             NotReadyError: If calibration pairs were appended after the last training.
-            CouplingError: If the coupling has not converged.
         """
         coupler = self.coupler if coupler is None else coupler
         check("coupler", coupler, SinkhornCoupler)
-        check("unseen", unseen, Literal["raise", "extend"])
-        batch = self.embed(
+        x_o, real, _, simulated = self.embed(
             x_o,
             num_simulations=num_simulations,
             seed=seed,
             show_progress_bars=show_progress_bars,
         )
-        warn_of_far_entries("x_o", batch.x_o, self._npe.h)
-        self._warn_of_prior(coupler.tau)
-        coupling = batch.couple(coupler)
-        if require_convergence and not coupling.converged:
-            raise CouplingError(
-                "The coupling has not converged: marginal error "
-                f"{coupling.marginal_error:.1e} after {coupling.num_iterations} "
-                f"iterations, tolerance {coupler.tolerance:.1e}. Use a larger gamma, "
-                "more max_iterations, or require_convergence=False."
-            )
-        return batch.posterior(coupling, unseen=unseen)
+        npe = self.npe
+        warn_of_far_entries("x_o", x_o, npe.h)
+        # A copy, so that moving one posterior to a device leaves others where they are.
+        net = copy.deepcopy(self._net)
+        coupling = coupler.couple(real, simulated)
+        posterior = MixturePosterior(
+            Coupled(npe.density(), simulated, x_o, net, coupling),
+            npe.prior,
+            enable_transform=npe.enable_transform,
+        )
+        posterior.parameter_names, posterior.x_names = npe.parameter_names, npe.x_names
+        return posterior
 
-    def _warn_of_prior(self, tau: float) -> None:
-        """Warn once if a batch is spread over a prior that the labels do not follow."""
-        if self._prior_is_compared or tau < 1 or not len(self.pairs):
-            return
-        self._prior_is_compared = True
-        found = probability_of_prior(self.pairs, self._npe.prior)
-        if is_improbable(found):
-            warn_user(
-                "The labels are not distributed like the prior (probability that they "
-                f"are: {found:.1g}), over which tau=1 spreads the batch. Use a smaller "
-                "tau, or `stack`."
-            )
+    @property
+    def _net(self) -> nn.Module:
+        return self.npe.h if self._g is None else self._g
 
     def tuned_posterior(self) -> Any:
         r"""Return the flow on the tuned embedding, :math:`q(\theta \mid g(x))`.
 
         It is an sbi posterior for any x, the paper's ablation "tuning-only".
         """
-        return self._npe.posterior(self.tuned_embedding_net)
-
-    def checked_observations(self, x_o: Tensor) -> Tensor:
-        """Return a copy of a batch ``(n_o, *event)``, if it can be embedded."""
-        return self._npe.as_x("x_o", x_o)
-
-    @property
-    def npe(self) -> Any:
-        """A copy of the NPE posterior that this object repairs."""
-        return self._npe.posterior()
-
-    @property
-    def calibration(self) -> tuple[Tensor, Tensor]:
-        """The pairs so far, theta and x; theta is a mean if a label is not exact."""
-        return self.pairs.mean.clone(), self.pairs.x.clone()
-
-    @property
-    def parameter_names(self) -> tuple[str, ...] | None:
-        """The names of the parameters; None if they have none."""
-        return self._npe.parameter_names
-
-    @property
-    def x_names(self) -> tuple[str, ...] | None:
-        """The names of the columns of tables of x; None if they are not known."""
-        return self._npe.x_names
+        return self.npe.posterior(self.tuned_embedding_net)
 
     @property
     def embedding_net(self) -> nn.Module:
         """A copy of h, the embedding net of NPE with sbi's standardising layer."""
-        return copy.deepcopy(self._npe.h)
+        return copy.deepcopy(self.npe.h)
 
     @property
     def tuned_embedding_net(self) -> nn.Module:
@@ -511,31 +392,3 @@ class RoPE:
         if self._history is None:
             raise NotReadyError("Nothing was trained yet. Call `train()` first.")
         return self._history
-
-    @property
-    def num_dropped_simulations(self) -> int:
-        """Number of simulations dropped so far because of NaN or Inf."""
-        return self.source.num_dropped
-
-    @property
-    def num_simulator_calls(self) -> int:
-        """How many rows of theta the simulator has simulated so far.
-
-        These are 100 for each label by :meth:`train` (and 2000 with rehearsal),
-        ``max(n_o, 1000)`` for each batch by :meth:`build_posterior`, and by
-        :func:`~sbi_rope.stack` 10,000 from the prior and 100 for each label. A few at
-        the start, by which RoPE finds out how to call the simulator, do not count.
-        """
-        return self.source.num_calls
-
-    def __repr__(self) -> str:
-        name = type(self._npe.estimator).__name__
-        state = "trained" if self.is_trained else "not trained"
-        return (
-            f"RoPE({name}, {len(self.pairs)} calibration pairs in "
-            f"{self.pairs.num_groups} groups, {state}, "
-            f"gamma {self.coupler.gamma:g}, tau {self.coupler.tau:g})"
-        )
-
-    def _embed_simulations(self, x: Tensor) -> Tensor:
-        return embed(self._npe.h, x)

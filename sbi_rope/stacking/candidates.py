@@ -393,7 +393,7 @@ class UnlabelledCandidate(Candidate):
 
     def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
         """Train NPE on corrected simulations."""
-        x_o = as_batch("x_o", data.rope.checked_observations(self.x_o))
+        x_o = as_batch("x_o", data.rope.npe.as_x("x_o", self.x_o))
         x_s = data.simulations[1]
         unit = Standardisation(x_s.double())
         chosen = torch.randperm(len(x_o))[:MAX_OBSERVATIONS]
@@ -509,7 +509,7 @@ def default_candidates(
         RegressionCandidate(embeds=True),
     ]
     if x_o is not None:
-        x_o = x_o if rope is None else rope.checked_observations(x_o)
+        x_o = x_o if rope is None else rope.npe.as_x("x_o", x_o)
         candidates.append(UnlabelledCandidate(x_o))
     candidates = [one for one in candidates if learn_prior or not one.learns_prior]
     if rope is None:

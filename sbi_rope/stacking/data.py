@@ -15,8 +15,7 @@ from sbi_rope.density.base import Density
 from sbi_rope.discrepancy.correction import Space, tuning_targets
 from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.report import DiscrepancyReport, report_discrepancy
-from sbi_rope.npe.prior import PriorDistribution
-from sbi_rope.npe.sbi import embed, estimator_of, has_parameters
+from sbi_rope.npe.sbi import embed, has_parameters
 from sbi_rope.npe.standardisation import Standardisation
 from sbi_rope.rope.rope import RoPE
 from sbi_rope.utils.errors import NotReadyError
@@ -58,8 +57,8 @@ class StackData:
         self, rope: RoPE, *, num_folds: int, seed: int, show_progress_bars: bool
     ) -> None:
         self.rope, self.npe, self.show = rope, rope.npe, show_progress_bars
-        self.estimator, self.source = estimator_of(self.npe), rope.source
-        self.prior, self.pairs = PriorDistribution(self.npe.prior), rope.pairs
+        self.estimator, self.source = rope.npe.estimator, rope.source
+        self.prior, self.pairs = rope.npe.prior, rope.pairs
         self.model, self.embedding_net = DiscrepancyModel(), rope.embedding_net
         labels = len(self.pairs.label.unique())
         if (count := min(self.pairs.num_groups, labels)) < 2:

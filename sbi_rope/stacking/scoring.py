@@ -100,7 +100,7 @@ def score_folds(
             log_unit=_log_unit(data),
             weight=weight,
             group=pairs.group if pairs.num_groups < len(pairs) else None,
-            parameter_names=data.rope.parameter_names,
+            parameter_names=data.npe.parameter_names,
         ),
         set_scores=set_scores,
         labels="" if are_plain else str(pairs),

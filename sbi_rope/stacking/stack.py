@@ -91,9 +91,9 @@ def stack(
     check("rope", rope, RoPE)
     check("num_folds", num_folds, Annotated[int, Range(2)])
     check("learning_curve", learning_curve, bool)
-    start, calls = time.perf_counter(), rope.num_simulator_calls
+    start, calls = time.perf_counter(), rope.source.num_calls
     if x_o is not None:
-        x_o = rope.checked_observations(x_o)
+        x_o = rope.npe.as_x("x_o", x_o)
         warn_of_far_entries("x_o", x_o, rope.embedding_net)
     of_data, of_scores = draw_seeds(seed, 2)
     data = StackData(
@@ -144,7 +144,7 @@ def stack(
             "seed": "none, so that a repetition differs" if seed is None else str(seed),
             "seconds": f"{time.perf_counter() - start:.0f}",
             "left out": "; ".join(c.name for c in known if c not in chosen) or "none",
-            "simulator calls": f"{rope.num_simulator_calls - calls:,}",
+            "simulator calls": f"{rope.source.num_calls - calls:,}",
         },
     )
     posterior = StackedPosterior(
@@ -153,7 +153,8 @@ def stack(
         report=report,
         enable_transform=data.npe.enable_transform,
     )
-    posterior.parameter_names, posterior.x_names = rope.parameter_names, rope.x_names
+    npe = rope.npe
+    posterior.parameter_names, posterior.x_names = npe.parameter_names, npe.x_names
     return posterior
 
 

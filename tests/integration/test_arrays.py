@@ -25,7 +25,7 @@ def test_pairs_and_observations_are_those_of_tensors(convert: Any) -> None:
     npe = problems.npe_posterior("mdn")
     given = RoPE(npe, simulator=problems.simulate, finetuner=QUICK)
     given.append_calibration(*map(convert, PAIRS))
-    for ours, tensor in zip(given.calibration, PAIRS, strict=True):
+    for ours, tensor in zip((given.pairs.mean, given.pairs.x), PAIRS, strict=True):
         assert ours.dtype == torch.float32
         assert torch.equal(ours, tensor)
     given.train(seed=0, **QUIET)

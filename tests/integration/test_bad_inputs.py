@@ -96,13 +96,13 @@ def of_posterior(kind: str, make: Callable[[], Any]) -> dict[str, Call]:
 
 def with_simulations(theta: Tensor = THETA_S, x: Tensor = X_S) -> Tensor:
     rope = RoPE(npe(), simulations=(theta, x))
-    return rope.embed(X_O, seed=0).simulated
+    return rope.embed(X_O, seed=0)[3]
 
 
 CALLS: dict[str, Call] = {
     "RoPE": with_simulations,
     "RoPE.append_calibration": lambda theta=THETA, x=X: (
-        untrained().append_calibration(theta, x).calibration[0]
+        untrained().append_calibration(theta, x).pairs.mean
     ),
     "RoPE.append_calibration(noise)": lambda theta_std=ONES: (
         untrained().append_calibration(THETA, X, theta_std=theta_std)

@@ -16,8 +16,7 @@ from tests import gaussian
 def with_exact_g(x_o: Tensor, n_s: int, coupler: SinkhornCoupler) -> MixturePosterior:
     """The mixture for g(x_o) = h of the simulation behind x_o."""
     npe = gaussian.posterior()
-    rope = RoPE(npe, simulator=gaussian.simulator)
-    h = rope.embedding_net
+    h = npe.posterior_estimator.embedding_net
     with torch.no_grad():
         simulated = h(gaussian.simulator(gaussian.prior().sample((n_s,))))
         coupling = coupler.couple(h(gaussian.undo(x_o)), simulated)

@@ -280,7 +280,7 @@ def test_a_stack_changes_nothing_that_it_is_given_and_follows_from_its_seed() ->
     def given() -> list[Tensor]:
         nets = estimator, rope.tuned_embedding_net
         weights = [value for net in nets for value in net.state_dict().values()]
-        return [*weights, *rope.calibration]
+        return [*weights, rope.pairs.mean, rope.pairs.x]
 
     before = copy.deepcopy(given())
     torch.manual_seed(5)

@@ -174,7 +174,7 @@ def test_weights_of_families_are_summed_and_explained() -> None:
 def test_estimates_and_ranks_are_those_of_hold_out_pairs() -> None:
     with quick(), patch("sbi_rope.stacking.scoring.NUM_SAMPLES", 400):
         report = stack(rope_of(), **DEFAULTS).report
-    held_out, theta = report.held_out, rope_of().calibration[0]
+    held_out, theta = report.held_out, rope_of().pairs.mean
     # Of pairs in another order the correlation is 0.24.
     above = torch.stack(
         [held_out.ranks.flatten(), (theta - held_out.estimates).flatten()]
@@ -368,10 +368,10 @@ def test_a_score_far_below_the_others_is_an_arrow_with_its_number() -> None:
 @pytest.mark.medium
 def test_a_report_says_how_often_the_simulator_was_called_for_the_stack() -> None:
     rope = rope_of()
-    before = rope.num_simulator_calls
+    before = rope.source.num_calls
     report = stacked(rope, candidates=[PRIOR, DISCREPANCY]).report
     # 300 from the prior and 5 at the parameters of each of 20 pairs.
-    assert calls_of(report) == rope.num_simulator_calls - before == 400
+    assert calls_of(report) == rope.source.num_calls - before == 400
     assert "with 400 calls of the simulator" in flat(report)
     # Those from the prior are kept for the next stack.
     assert calls_of(stacked(rope, candidates=[PRIOR, DISCREPANCY]).report) == 100

@@ -91,7 +91,7 @@ def test_an_entry_that_varies_only_in_reality_is_named_and_ignored() -> None:
                 posterior.log_prob_batched(THETA[:5], other, norm_posterior=False)
                 for other in (x, x + torch.tensor([0.0, 0.0, 1e6]))
             ]
-            for posterior in (rope.npe, stacked)
+            for posterior in (rope.npe.posterior(), stacked)
         ]
     usual, in_another_unit = (one["entries far from simulations"] for one in looks)
     assert not usual.alarming
@@ -108,7 +108,7 @@ def test_x_that_is_too_long_without_a_net_is_refused_before_training() -> None:
     npe.append_simulations(THETA, x).train(max_num_epochs=1)
     rope = RoPE(npe.build_posterior(), simulations=(THETA, x))
     rope.append_calibration(THETA_CAL, x[::2])
-    method = DiscrepancyNPE.from_posterior(rope.npe, simulations=(THETA, x))
+    method = DiscrepancyNPE.from_posterior(rope.npe.posterior(), simulations=(THETA, x))
     method.append_calibration(THETA_CAL, x[::2])
     for train in (lambda: stack(rope, **DEFAULTS), lambda: method.train(**QUIET)):
         with pytest.raises(InvalidInputError, match="Train NPE with an embedding net"):

@@ -278,17 +278,11 @@ def test_tuning_on_partial_labels_keeps_what_x_says_about_missing_parameters() -
 # What users pass ----------------------------------------------------------------------
 
 
-def test_labels_that_say_nothing_are_left_out() -> None:
+def test_labels_that_say_nothing_are_refused() -> None:
     theta, x = gaussian.labelled(6)
     theta[2:4] = NAN
-    groups = ["a", "b", "c", "d", "b", "e"]
-    with pytest.warns(RoPEWarning, match=r"left out: 2 of 6 rows"):
-        pairs = rope().append_calibration(theta, x, groups=groups).pairs
-    keep = torch.tensor([0, 1, 4, 5])
-    assert torch.equal(pairs.mean, theta[keep])
-    assert torch.equal(pairs.x, x[keep])
-    assert pairs.group.tolist() == [0, 1, 1, 2]
-    assert pairs.are_exact
+    with pytest.raises(InvalidInputError, match="NaN only in 2 of 6 rows"):
+        rope().append_calibration(theta, x)
 
 
 @pytest.mark.medium
@@ -297,7 +291,7 @@ def test_exact_and_noisy_labels_may_be_appended_one_after_the_other() -> None:
     conductor = rope().append_calibration(theta[:4], x[:4])
     conductor.append_calibration(theta[4:], x[4:], theta_std=0.3)
     assert str(conductor.pairs) == "6 labels, 2 with noise and 0 partial"
-    known, _ = conductor.calibration
+    known = conductor.pairs.mean
     assert torch.allclose(known[:4], theta[:4])
     # The posterior mean of a noisy label is nearer to the mean of the prior.
     assert torch.allclose(known[4:], theta[4:] / 1.09, atol=0.1)

@@ -33,7 +33,7 @@ def matrices(
     return values + draw(st.sampled_from([0.0, 1.0, -1e4]))
 
 
-@pytest.mark.filterwarnings("ignore:Coupling a batch")
+@pytest.mark.filterwarnings("ignore:Coupling a batch", "ignore:The coupling has not")
 @brief
 @given(
     real=matrices(largest=1e4),

@@ -239,8 +239,4 @@ def test_bars_that_are_asked_for_are_shown_without_a_terminal_and_on_stderr(
     printed = capsys.readouterr()
     assert printed.out == ""
     for bar in ("Fine-tuning", "Sampling", "Epochs trained: 3"):
-        "Fine-tuning",
-        "Sampling",
-        "Training neural network. Epochs trained: 3",
-    ):
         assert bar in printed.err
