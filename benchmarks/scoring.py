@@ -111,7 +111,6 @@ def _score_couplings(case: Case, cells: Sequence[Cell]) -> Iterator[Result]:
                     cost_scale=cell.cost_scale,  # type: ignore[arg-type]
                 ),
                 seed=case.seed,
-                require_convergence=False,
                 show_progress_bars=False,
             )
             made = trained + case.num_simulated - before

@@ -56,7 +56,7 @@ def test_a_table_is_put_in_the_order_of_the_first_one() -> None:
     rope.append_calibration(first, x_first, theta_std=noise)
     rope.append_calibration(second, x_second, theta_std=noise.iloc[0])
     assert torch.equal(rope.pairs.y, torch.cat([theta, theta]))
-    assert torch.equal(rope.calibration[1], torch.cat([x, x]))
+    assert torch.equal(rope.pairs.x, torch.cat([x, x]))
     assert torch.allclose(rope.pairs.std.float(), torch.tensor([0.1, 0.2]))
     options: Any = {"training": Training(max_num_epochs=1), "num_holdouts": 2}
     method = FinetunedNPE.from_posterior(gaussian.posterior(), **options)

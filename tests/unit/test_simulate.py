@@ -219,16 +219,16 @@ def test_a_budget_is_simulated_once_and_then_used_as_stored_simulations_are() ->
 
     rope, tried = made(simulator=simulator, num_simulations=1200), sum(calls)
     found = rope.train(seed=0).build_posterior(x, seed=0, num_simulations=1200)
-    assert sum(calls) - tried == rope.num_simulator_calls == 1200
+    assert sum(calls) - tried == rope.source.num_calls == 1200
     stored = made(simulations=rope.source.from_prior(1200)).train(seed=0)
     expected = stored.build_posterior(x, seed=0, num_simulations=1200)
     assert torch.allclose(found.weights.sort().values, expected.weights.sort().values)
-    assert stored.num_simulator_calls == 0
+    assert stored.source.num_calls == 0
     assert rope.build_posterior(x).weights.shape == (10, 1000)
     assert rope.build_posterior(x, num_simulations=1201).weights.shape == (10, 1200)
     without = made(simulator=simulator).train()
     without.build_posterior(x)
-    assert without.num_simulator_calls == 10 * 100 + 1000
+    assert without.source.num_calls == 10 * 100 + 1000
     with pytest.raises(InvalidInputError, match="`num_simulations` with a simulator"):
         RoPE(gaussian.posterior(), simulations=(theta, x), num_simulations=10)
 
