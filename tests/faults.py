@@ -250,7 +250,7 @@ FAULTS = [
                 right(seed + 1, "calibration") if use == "test" else right(seed, use)
             )
         ),
-        "unit/test_tasks_splits.py",
+        "unit/test_tasks_base.py",
     ),
     Fault(
         "Recorded calibration pairs are test pairs as well",
@@ -258,7 +258,7 @@ FAULTS = [
         lambda right: (
             lambda self, part: sorted({*right(self, "calibration"), *right(self, part)})
         ),
-        "unit/test_tasks_splits.py",
+        "unit/test_tasks_base.py",
     ),
     Fault(
         "Biased calibration parameters crowd half as much",
