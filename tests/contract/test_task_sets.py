@@ -93,7 +93,9 @@ def test_sets_have_the_shapes_asked_for_and_no_observation_in_common(
         torch.manual_seed(seed)
         assert same_rows(prior.sample(torch.Size((1000,))), theta) == 0
     for one, other in ((0, 0), (0, 1), (1, 0)):
-        calibration, test = (drawn.sets[p, s] for p, s in zip(PARTS, (one, other), strict=True))
+        calibration, test = (
+            drawn.sets[p, s] for p, s in zip(PARTS, (one, other), strict=True)
+        )
         assert same_rows(calibration[1], test[1]) == 0
         assert same_rows(calibration[0], test[0]) <= 0.01 * len(test[0])
 
