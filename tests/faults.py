@@ -216,13 +216,13 @@ FAULTS = [
         "Hearts eject a tenth less than their stroke volume",
         "tasks.hemodynamics.inflow:aortic_inflow",
         result(lambda flow: 0.9 * flow),
-        "unit/test_hemodynamics_inflow.py",
+        "unit/test_hemodynamics_network.py",
     ),
     Fault(
         "Recordings begin in the first half of a beat",
         "tasks.hemodynamics.records:play",
         argument(start=lambda start: start / 2),
-        "unit/test_tasks_hemodynamics.py",
+        "unit/test_hemodynamics_records.py",
     ),
     Fault(
         "The light through two polarisers falls with the cosine",
