@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from sbi_rope.tasks.hemodynamics.network import Network, Outlets
-from sbi_rope.tasks.hemodynamics.solver import solve
+from sbi_rope.tasks.hemodynamics.solver import Flow, solve
 from sbi_rope.tasks.hemodynamics.subject import NUM_SEGMENTS, Subject
 
 # A man of 25, all parameters at their means.
@@ -51,12 +51,14 @@ def make_network(
 ) -> Network:
     """Return tubes between nodes, all with the same walls and outlets."""
     num = len(nodes)
+    inlet_node, outlet_node = np.array(nodes).T
+    inlet_radius, outlet_radius = np.array(radius).T
     return Network(
-        inlet_node=np.array([node[0] for node in nodes]),
-        outlet_node=np.array([node[1] for node in nodes]),
+        inlet_node=inlet_node,
+        outlet_node=outlet_node,
         length=np.array(length),
-        inlet_radius=np.array([pair[0] for pair in radius]),
-        outlet_radius=np.array([pair[1] for pair in radius]),
+        inlet_radius=inlet_radius,
+        outlet_radius=outlet_radius,
         stiffness=np.array([[0.0] * num, [0.0] * num, [6e4] * num]),
         wall_viscosity=np.array([[viscosity] * num, [0.0] * num]),
         reference_pressure=np.full(num, REST),
@@ -100,10 +102,8 @@ def linear_pressure(
     """
     spectrum = np.fft.rfft(inflow)[1 : num_harmonics + 1]
     omega = 2 * np.pi / period * np.arange(1, len(spectrum) + 1)
-    num_segments = len(network.length)
-    lines = [
-        _transmission(network, k, 1.0, omega, pressure) for k in range(num_segments)
-    ]
+    segments = range(len(network.length))
+    lines = [_transmission(network, k, 1.0, omega, pressure) for k in segments]
     nodal = _node_pressures(network, lines, spectrum, omega)
     waves = []
     for segment, position in sites:
@@ -117,6 +117,15 @@ def linear_pressure(
         coefficients[1 : len(spectrum) + 1] = d * inlet - b * flow_in
         waves.append(np.fft.irfft(coefficients, len(inflow)))
     return np.stack(waves)
+
+
+def relative_rms(flow: Flow, exact: np.ndarray) -> float:
+    """Return the largest difference from waves around rest, over their own rms."""
+    times = exact.shape[1]
+    waves = flow.at(np.arange(times) / times)
+    waves -= waves.mean(axis=1, keepdims=True)
+    error = np.sqrt(((waves - exact) ** 2).mean(axis=1))
+    return float((error / exact.std(axis=1)).max())
 
 
 def _node_pressures(
