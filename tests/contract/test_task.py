@@ -35,9 +35,6 @@ def task(kind: tuple[str, str | None]) -> Task:
     return make(kind[0], variant=kind[1])
 
 
-# The prior ---------------------------------------------------------------------------
-
-
 @TASK
 def test_the_description_has_an_entry_for_every_parameter_and_variant(
     task: Task,
@@ -129,9 +126,6 @@ def test_the_density_of_the_prior_is_that_of_the_paper() -> None:
     for name, (theta, expected) in ANALYTIC.items():
         log_prob = make(name).get_prior().log_prob(torch.tensor(theta))
         assert log_prob.tolist() == pytest.approx(expected, rel=1e-5)
-
-
-# The simulator and the network -------------------------------------------------------
 
 
 @pytest.mark.medium

@@ -11,10 +11,9 @@ import pytest
 from sbi_rope.tasks.hemodynamics.arteries import CAROTID_PATH, FEMORAL_PATH, MMHG
 from sbi_rope.tasks.hemodynamics.inflow import aortic_inflow
 from sbi_rope.tasks.hemodynamics.network import build_network
-from sbi_rope.tasks.hemodynamics.solver import solve
 from sbi_rope.tasks.hemodynamics.subject import Beat, Physics
 from sbi_rope.tasks.hemodynamics.waveforms import SITES, simulate_beat, simulate_sites
-from tests.blood_flow import BASELINE, linear_pressure, openbf_error, relative_rms
+from tests.blood_flow import BASELINE, openbf_error, small_wave_error
 from tests.conftest import SHARED_DATA, TEST_DATA
 
 pytest.importorskip("numba")
@@ -27,9 +26,6 @@ OPENBF = SHARED_DATA / "hemodynamics" / "reference_openbf"
 @pytest.fixture(scope="module")
 def beat() -> Beat:
     return simulate_beat(BASELINE)
-
-
-# Other solutions ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -52,46 +48,29 @@ def test_pressures_in_77_arteries_come_closer_to_openbf_with_finer_cells() -> No
     assert fine < 0.75 * coarse
 
 
-def linear_error(*, viscoelastic: bool, cell_length: float) -> float:
-    """Return the difference from the exact small waves, in % of their rms.
-
-    The largest over the sites. Without mean flow and with a mean pressure that is the
-    same everywhere, since the exact solution is one of small waves around rest.
-    """
-    network = build_network(BASELINE, Physics(viscoelastic=viscoelastic))
-    rest = BASELINE.mean_pressure * MMHG
-    network = replace(network, outlets=replace(network.outlets, pressure=rest))
-    inflow = 1e-8 * aortic_inflow(BASELINE, 2000)  # m^3/s, a hundredth
-    sites = list(SITES.values())
-    flow = solve(
-        network,
-        inflow - inflow.mean(),
-        BASELINE.period,
-        sites=sites,
-        start_pressure=rest,
-        stored_pressure=np.full(len(network.outlets.segment), rest),
-        cell_length=cell_length,
-        courant=0.6,
-        num_cycles=10,
-        convection=0.0,
-    )
-    period = BASELINE.period
-    exact = linear_pressure(
-        network, inflow, period, pressure=rest, sites=sites, num_harmonics=60
-    )
-    return 100 * relative_rms(flow, exact)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("viscoelastic", [False, True])
 def test_small_waves_come_closer_to_the_linear_equations_with_finer_cells(
     viscoelastic: bool,
 ) -> None:
+    # Without mean flow and with a mean pressure that is the same everywhere, since the
+    # exact solution is one of small waves around rest.
+    network = build_network(BASELINE, Physics(viscoelastic=viscoelastic))
+    rest = BASELINE.mean_pressure * MMHG
     coarse, usual, fine = (
-        linear_error(viscoelastic=viscoelastic, cell_length=length)
-        for length in (0.02, 0.01, 0.005)
+        small_wave_error(
+            replace(network, outlets=replace(network.outlets, pressure=rest)),
+            1e-8 * aortic_inflow(BASELINE, 2000),  # m^3/s, a hundredth
+            BASELINE.period,
+            pressure=rest,
+            sites=list(SITES.values()),
+            num_harmonics=60,
+            num_cycles=10,
+            cell_length=cell_length,
+        )
+        for cell_length in (0.02, 0.01, 0.005)
     )
-    assert usual < 3.0
+    assert usual < 0.03
     assert fine < 0.6 * coarse
 
 
@@ -106,9 +85,6 @@ def test_cells_of_another_length_and_shorter_steps_give_the_same_beat(
     coarse, fine = (radial(cell_length=length) for length in (0.02, 0.005))
     assert np.abs(coarse - fine).max() < 1.0
     assert np.abs(radial(courant=0.3) - beat.pressure["radial"]).max() < 0.3
-
-
-# Physiology --------------------------------------------------------------------------
 
 
 def velocity_error(velocity: float, *, viscoelastic: bool) -> float:

@@ -12,12 +12,11 @@ import torch
 from sbi_rope.tasks.hemodynamics import generation
 from sbi_rope.tasks.hemodynamics.__main__ import main
 from sbi_rope.tasks.hemodynamics.dataset import load
-from sbi_rope.tasks.hemodynamics.generation import generate
 from sbi_rope.tasks.hemodynamics.population import NUISANCES, Population
 from sbi_rope.tasks.hemodynamics.records import NUM_STEPS, Recorder, play
 from sbi_rope.tasks.hemodynamics.subject import Beat, Physics, Subject
 from sbi_rope.tasks.hemodynamics.task import Hemodynamics
-from sbi_rope.utils.errors import InvalidInputError, SimulationError
+from sbi_rope.utils.errors import SimulationError
 from tests.fresh import imported_anew
 
 N = 65
@@ -38,16 +37,18 @@ def hum(subject: Subject, physics: Physics) -> Beat:
     )
 
 
-def make(path: Path, *, jobs: int = 1) -> None:
+def make(path: Path, *, jobs: int = 1) -> int:
+    """Run the command with the stand-in."""
+    options = f"generate --n {N} --process real --seed 4 --jobs {jobs} --out {path}"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(generation, "simulate_beat", hum)
-        generate(path, n=N, process="real", seed=4, jobs=jobs, progress=False)
+        return main(options.split())
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("beats") / "real.npz"
-    make(path)
+    assert make(path) == 0
     return path
 
 
@@ -77,32 +78,20 @@ def test_rows_belong_to_the_first_people_who_can_be_simulated(made: Path) -> Non
     assert beats.beat.dtype == beats.theta.dtype == torch.float32
 
 
-def test_a_file_has_the_same_bytes_for_any_number_of_jobs_and_is_never_overwritten(
-    made: Path, tmp_path: Path
+def test_the_command_writes_the_same_bytes_with_any_number_of_jobs_and_only_once(
+    made: Path, tmp_path: Path, terminal: pytest.CaptureFixture[str]
 ) -> None:
+    again = tmp_path / "again.npz"
     with joblib.parallel_config(backend="threading"):
-        make(tmp_path / "again.npz", jobs=2)
-    assert (tmp_path / "again.npz").read_bytes() == made.read_bytes()
-    assert [path.name for path in tmp_path.iterdir()] == ["again.npz"]
-    with pytest.raises(InvalidInputError, match="Expected no file"):
-        make(made)
-
-
-def test_the_command_writes_the_file_and_counts_the_rejected(
-    tmp_path: Path,
-    terminal: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(generation, "simulate_beat", hum)
-    out = tmp_path / "x.npz"
-    options = f"generate --n 50 --process real --seed 3 --out {out}"
-    assert main(options.split()) == 0
+        assert make(again, jobs=2) == 0
+    assert again.read_bytes() == made.read_bytes()
+    assert list(tmp_path.iterdir()) == [again]
     captured = terminal.readouterr()
-    beats = load(out, process="real")
-    assert (len(beats), beats.settings["seed"]) == (50, 3)
-    rejected = sum(beats.rejected.values())
-    assert f"50 people, {rejected} rejected" in captured.out
-    assert "50/50" in captured.err  # of the progress bar
+    rejected = sum(load(made, process="real").rejected.values())
+    assert f"{N} people, {rejected} rejected" in captured.out
+    assert f"{N}/{N}" in captured.err  # of the progress bar
+    assert make(made) == 2
+    assert "Expected no file" in terminal.readouterr().err
 
 
 @pytest.mark.medium

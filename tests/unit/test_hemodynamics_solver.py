@@ -1,33 +1,17 @@
 """The solver of blood flow, on small networks, and the beats made with it."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 
 from sbi_rope.tasks.hemodynamics import waveforms
 from sbi_rope.tasks.hemodynamics.network import Network
-from sbi_rope.tasks.hemodynamics.solver import Flow, solve
-from tests.blood_flow import BASELINE, REST, linear_pressure, make_network, relative_rms
+from tests.blood_flow import BASELINE, REST, make_network, run, small_wave_error
 
 pytest.importorskip("numba")
 
 PERIOD = 0.8  # s
 SPEED = np.sqrt(2 / 3 * 6e4 / 1060)  # of waves in the tubes below, m/s
 HALF_SINE = np.maximum(np.sin(np.linspace(0, 2 * np.pi, 400, endpoint=False)), 0)
-
-
-def run(network: Network, inflow: np.ndarray, **changes: Any) -> Flow:
-    options: dict[str, Any] = {
-        "sites": [(0, 0.5)],
-        "start_pressure": REST,
-        "stored_pressure": np.full(len(network.outlets.segment), REST),
-        "cell_length": 0.01,
-        "courant": 0.6,
-        "num_cycles": 3,
-        "convection": 4 / 3,
-    }
-    return solve(network, inflow, PERIOD, **{**options, **changes})
 
 
 def loop(*, viscosity: float = 0.0, turned: tuple[int, ...] = ()) -> Network:
@@ -49,7 +33,7 @@ def loop(*, viscosity: float = 0.0, turned: tuple[int, ...] = ()) -> Network:
 @pytest.mark.medium
 @pytest.mark.parametrize("viscosity", [0.0, 0.6])
 def test_tapered_arteries_at_rest_stay_at_rest(viscosity: float) -> None:
-    flow = run(loop(viscosity=viscosity), np.zeros(10), num_cycles=5)
+    flow = run(loop(viscosity=viscosity), np.zeros(10), PERIOD, num_cycles=5)
     np.testing.assert_allclose(flow.pressure, REST, rtol=1e-9)
 
 
@@ -66,7 +50,8 @@ def test_a_steady_flow_loses_pressure_by_friction_only(viscosity: float) -> None
         resistance=(5e7, 5e7),
     )
     options = {"num_cycles": 60, "cell_length": 0.005, "convection": 0.0}
-    flow = run(tube, np.full(10, current), sites=[(0, 0.0), (0, 1.0)], **options)
+    sites = [(0, 0.0), (0, 1.0)]
+    flow = run(tube, np.full(10, current), PERIOD, sites=sites, **options)
     start, end = flow.pressure.mean(axis=1)
     assert end - REST == pytest.approx(1e8 * current, rel=1e-5)
     # dp/dx = -rho f Q / A^2, where the tube is as wide as its pressure makes it.
@@ -83,7 +68,7 @@ def test_a_windkessel_empties_exponentially() -> None:
     tube = make_network(
         [(0, 1)], length=[0.01], radius=[(1e-3, 1e-3)], outlets=[0], resistance=(1, 3e8)
     )
-    flow = run(tube, np.zeros(10), start_pressure=2 * REST, stored_pressure=[2 * REST])
+    flow = run(tube, np.zeros(10), PERIOD, pressure=2 * REST)
     time = np.arange(flow.pressure.shape[1]) / flow.pressure.shape[1] * PERIOD
     decay = np.exp(-(time + 2 * PERIOD) / (3e8 * 1e-9))
     np.testing.assert_allclose(flow.pressure[0] / REST, 1 + decay, rtol=2e-3)
@@ -91,7 +76,7 @@ def test_a_windkessel_empties_exponentially() -> None:
 
 @pytest.mark.parametrize("viscosity", [0.0, 0.6])
 def test_no_volume_is_lost_in_branches_and_loops(viscosity: float) -> None:
-    flow = run(loop(viscosity=viscosity), 1e-4 * HALF_SINE)
+    flow = run(loop(viscosity=viscosity), 1e-4 * HALF_SINE, PERIOD)
     change = flow.volume_in - flow.volume_out
     assert abs(change) > 1e-8
     assert flow.volume_change == pytest.approx(change, abs=1e-12 * flow.volume_in)
@@ -101,18 +86,13 @@ def test_it_does_not_matter_which_end_of_a_segment_is_its_inlet() -> None:
     network, mirrored = (loop(viscosity=0.6, turned=k) for k in ((), (1, 2, 3)))
     # With coarse cells, some segments have no point but their ends.
     first, second = (
-        run(some, 1e-4 * HALF_SINE, sites=[(2, position), (4, 0.5)], cell_length=0.04)
-        for some, position in ((network, 0.25), (mirrored, 0.75))
+        run(some, 1e-4 * HALF_SINE, PERIOD, sites=[site, (4, 0.5)], cell_length=0.04)
+        for some, site in ((network, (2, 0.25)), (mirrored, (2, 0.75)))
     )
     np.testing.assert_allclose(first.pressure, second.pressure, rtol=1e-9)
 
 
-# Waves -------------------------------------------------------------------------------
-
-
-def test_a_wave_has_the_velocity_of_the_tube_law_and_a_bifurcation_reflects_it() -> (
-    None
-):
+def test_waves_have_the_velocity_of_the_tube_law_and_bifurcations_reflect() -> None:
     radius = np.array([0.01, 0.006, 0.005])
     tubes = make_network(
         [(0, 1), (1, 2), (1, 3)],
@@ -124,7 +104,7 @@ def test_a_wave_has_the_velocity_of_the_tube_law_and_a_bifurcation_reflects_it()
     pulse = np.zeros(400)
     pulse[:25] = np.sin(np.linspace(0, np.pi, 25)) ** 2
     changes = {"num_cycles": 2, "convection": 0.0, "cell_length": 0.005}
-    flow = run(tubes, 1e-7 * pulse, sites=[(0, 0.1), (0, 0.5)], **changes)
+    flow = run(tubes, 1e-7 * pulse, PERIOD, sites=[(0, 0.1), (0, 0.5)], **changes)
     time = np.arange(flow.previous.shape[1]) / flow.previous.shape[1] * PERIOD
     early = time < 2.0 / SPEED + 0.025
     first, second = time[flow.previous[:, early].argmax(axis=1)]
@@ -144,17 +124,17 @@ def test_a_wave_has_the_velocity_of_the_tube_law_and_a_bifurcation_reflects_it()
 def test_small_waves_in_a_loop_are_those_of_the_linear_equations(
     viscosity: float, cell_length: float
 ) -> None:
-    network, sites = loop(viscosity=viscosity), [(0, 0.0), (2, 0.5), (4, 0.5), (5, 1.0)]
-    inflow = 1e-8 * (HALF_SINE - HALF_SINE.mean())
-    options = {"num_cycles": 12, "convection": 0.0, "cell_length": cell_length}
-    flow = run(network, inflow, sites=sites, **options)
-    exact = linear_pressure(
-        network, inflow, PERIOD, pressure=REST, sites=sites, num_harmonics=80
+    error = small_wave_error(
+        loop(viscosity=viscosity),
+        1e-8 * HALF_SINE,
+        PERIOD,
+        pressure=REST,
+        sites=[(0, 0.0), (2, 0.5), (4, 0.5), (5, 1.0)],
+        num_harmonics=80,
+        num_cycles=12,
+        cell_length=cell_length,
     )
-    assert relative_rms(flow, exact) < 0.015
-
-
-# Beats -------------------------------------------------------------------------------
+    assert error < 0.015
 
 
 @pytest.mark.medium

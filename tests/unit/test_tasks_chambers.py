@@ -9,7 +9,6 @@ import pytest
 from sbi_rope.tasks.chambers import find_file, read_columns
 from sbi_rope.utils.errors import DataNotFoundError, InvalidInputError
 
-SENSORS = "lt_interventions_standard_v1"
 FILE = Path("lt_camera_v1", "first_1.8", "first_1.8.csv")
 
 
@@ -26,16 +25,6 @@ def test_missing_files_columns_and_numbers_are_named(tmp_path: Path) -> None:
         path.write_text(text)
         with pytest.raises(InvalidInputError, match=rf"t\.csv.*{match}"):
             read_columns(path, ["a", "b"])
-
-
-def test_the_extract_is_the_beginning_of_the_published_files(
-    chamber_root: Path, chamber_extract: Path
-) -> None:
-    extracts = list((chamber_extract / SENSORS).glob("*.csv"))
-    assert len(extracts) == 14
-    for extract in extracts:
-        published = (chamber_root / SENSORS / extract.name).read_bytes()
-        assert published.startswith(extract.read_bytes())
 
 
 def test_a_download_puts_the_whole_data_set_in_its_place(

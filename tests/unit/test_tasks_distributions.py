@@ -4,27 +4,10 @@ import pytest
 import torch
 from scipy.stats import kstest
 from torch.autograd.functional import jacobian
-from torch.distributions import Beta, biject_to
+from torch.distributions import biject_to
 
-from sbi_rope.tasks.distributions import Arcsine, UniformDistance, UniformTriangle
+from sbi_rope.tasks.distributions import Arcsine, UniformTriangle
 from sbi_rope.tasks.hemodynamics.prior import PopulationPrior
-
-
-def test_the_density_is_the_derivative_of_the_distribution_function() -> None:
-    d = torch.linspace(0.5, 39.5, 20, dtype=torch.float64, requires_grad=True)
-    for law in (UniformDistance, Arcsine):
-        some = law(torch.tensor([40.0], dtype=torch.float64))
-        (density,) = torch.autograd.grad(some.cdf(d).sum(), d)
-        torch.testing.assert_close(density, some.log_prob(d).exp())
-
-
-def test_arcsine_is_a_beta_of_one_half() -> None:
-    alpha = torch.linspace(0.001, 0.999, 99, dtype=torch.float64)
-    half = torch.tensor(0.5, dtype=torch.float64)
-    beta, malus = Beta(half, half), Arcsine(torch.ones(1, dtype=torch.float64))
-    torch.testing.assert_close(malus.log_prob(alpha), beta.log_prob(alpha))
-    torch.testing.assert_close(malus.mean, beta.mean.reshape(1))
-    torch.testing.assert_close(malus.variance, beta.variance.reshape(1))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -39,17 +22,9 @@ def test_arcsine_density_is_finite_at_its_ends_and_zero_beyond(
     assert (malus.log_prob(beyond) == -torch.inf).all()
 
 
-def test_a_triangle_is_filled_uniformly_up_to_its_edges() -> None:
-    triangle = UniformTriangle(torch.tensor(0.5))
-    places = [
-        [[0.4, 0.1], [0.5, 0.5], [0.0, 0.0]],
-        [[0.1, 0.2], [0.51, 0.1], [0.3, -0.1]],
-    ]
-    expected = torch.tensor([[8.0] * 3, [0.0] * 3])
-    density = triangle.log_prob(torch.tensor(places)).exp()
-    torch.testing.assert_close(density, expected)
-    # Rows of the triangle are uniform, wherever they are.
-    draws = triangle.sample((40_000,))
+def test_a_triangle_is_filled_uniformly() -> None:
+    draws = UniformTriangle(torch.tensor(0.5)).sample((40_000,))
+    # Its area to the left of a place grows with the square, whatever the height there.
     ratio = draws[:, 1] / draws[:, 0]
     assert kstest((2 * draws[:, 0]) ** 2, "uniform").pvalue > 1e-3
     assert kstest(ratio, "uniform").pvalue > 1e-3

@@ -80,23 +80,13 @@ def test_simulator_is_model_f1_of_causalchamber(size: int) -> None:
 @pytest.mark.filterwarnings("ignore:Arrays of 2-dimensional:DeprecationWarning")
 def test_stand_in_without_noise_is_model_f3_of_causalchamber() -> None:
     models = pytest.importorskip("causalchamber.models.image_capture")
-    response = [
-        [0.29958, 0.06920, 0.02816],
-        [0.04017, 0.92099, 0.31265],
-        [0.00217, 0.20716, 0.75763],
-    ]
+    red, green = (0.29958, 0.06920, 0.02816), (0.04017, 0.92099, 0.31265)
     constants = {
-        "S": np.array(response),
-        "w_r": 2.65625,
-        "w_g": 1.0,
-        "w_b": 1.77344,
-        "exposure": 2.5,
+        "S": np.array([red, green, (0.00217, 0.20716, 0.75763)]),
+        **{"w_r": 2.65625, "w_g": 1.0, "w_b": 1.77344, "exposure": 2.5},
         "Tp": np.array([[0.29, 0.35, 0.33]]).T,
         "Tc": np.array([[0.02, 0.08, 0.18]]).T,
-        "center_x": 0.5,
-        "center_y": 0.5,
-        "radius": 0.22,
-        "offset": 0,
+        **{"center_x": 0.5, "center_y": 0.5, "radius": 0.22, "offset": 0},
         "image_size": SIZE,
     }
     inputs = draw_inputs(30)
