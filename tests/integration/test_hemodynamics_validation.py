@@ -64,7 +64,6 @@ def test_small_waves_come_closer_to_the_linear_equations_with_finer_cells(
             BASELINE.period,
             pressure=rest,
             sites=list(SITES.values()),
-            num_harmonics=60,
             num_cycles=10,
             cell_length=cell_length,
         )

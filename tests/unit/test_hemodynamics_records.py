@@ -52,9 +52,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-# Stored beats ------------------------------------------------------------------------
-
-
 def test_rows_belong_to_the_first_people_who_can_be_simulated(made: Path) -> None:
     beats = load(made)
     people: list[Subject] = []

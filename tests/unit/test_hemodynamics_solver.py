@@ -130,7 +130,6 @@ def test_small_waves_in_a_loop_are_those_of_the_linear_equations(
         PERIOD,
         pressure=REST,
         sites=[(0, 0.0), (2, 0.5), (4, 0.5), (5, 1.0)],
-        num_harmonics=80,
         num_cycles=12,
         cell_length=cell_length,
     )

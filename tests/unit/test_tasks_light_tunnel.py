@@ -58,9 +58,6 @@ def write_experiment(root: Path, experiment: str, rows: range) -> None:
         image.save(folder / f"images_{SIZE}" / f"img_{i}.png")
 
 
-# The models --------------------------------------------------------------------------
-
-
 @pytest.mark.filterwarnings("ignore:Arrays of 2-dimensional:DeprecationWarning")
 @pytest.mark.parametrize("size", [10, 63, 64, 100])
 def test_simulator_is_model_f1_of_causalchamber(size: int) -> None:
@@ -122,9 +119,6 @@ def test_camera_adds_noise_before_it_rounds_to_8_bit() -> None:
     assert noise.std() == pytest.approx(math.sqrt(25 + 1 / 12), rel=0.01)
     # Half of the noise on black is cut off.
     assert (levels[:, :, ~inside] == 0).float().mean() == pytest.approx(0.54, abs=0.01)
-
-
-# The protocols -----------------------------------------------------------------------
 
 
 def test_crowded_parameters_are_beta_binomial() -> None:

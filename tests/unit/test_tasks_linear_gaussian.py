@@ -58,5 +58,3 @@ def test_parameters_observations_and_networks_have_the_dimension_asked_for() -> 
     theta, x_o = task.get_calibration_set(3)
     assert theta.shape == x_o.shape == (3, 25)
     assert task.get_embedding_net()(x_o).shape == (3, 50)
-    biased = LinearGaussian(dim=25, variant="biased_calibration")
-    assert biased.get_calibration_set(20)[0].shape == (20, 25)

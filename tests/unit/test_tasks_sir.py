@@ -37,17 +37,11 @@ def test_without_noise_the_numbers_solve_the_ordinary_equations() -> None:
         s, log_i = state
         return [-beta * s * math.exp(log_i), beta * s - gamma]
 
+    start, options = (0.999, math.log(0.001)), {"rtol": 1e-10, "atol": 1e-12}
+    days = {"t_span": (0, 364), "t_eval": np.arange(365)}
     expected = np.stack(
         [
-            solve_ivp(
-                derivative,
-                (0, 364),
-                (0.999, math.log(0.001)),
-                t_eval=np.arange(365),
-                args=rates,
-                rtol=1e-10,
-                atol=1e-12,
-            ).y[1]
+            solve_ivp(derivative, y0=start, args=rates, **days, **options).y[1]
             for rates in theta.double().tolist()
         ]
     )
