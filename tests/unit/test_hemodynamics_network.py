@@ -62,9 +62,7 @@ def test_the_ways_end_in_the_middle_of_the_carotid_and_of_the_femoral_artery() -
     assert measured == pytest.approx(expected, rel=1e-12)
 
 
-def test_outlets_have_the_resistance_of_the_target_pressure_and_match_arteries() -> (
-    None
-):
+def test_outlets_have_the_resistance_of_the_target_and_match_their_artery() -> None:
     network = build_network(BASELINE, Physics())
     outlets = network.outlets
     total = outlets.proximal_resistance + outlets.distal_resistance
