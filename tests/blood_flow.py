@@ -7,11 +7,12 @@ References:
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from sbi_rope.tasks.hemodynamics.network import Network, Outlets
-from sbi_rope.tasks.hemodynamics.solver import solve
+from sbi_rope.tasks.hemodynamics.solver import Flow, solve
 from sbi_rope.tasks.hemodynamics.subject import NUM_SEGMENTS, Subject
 
 # A man of 25, all parameters at their means.
@@ -32,10 +33,7 @@ BASELINE = Subject(
 )
 REST = 1e4  # Pa, of the networks of equal walls below
 PIECE_LENGTH = 2e-3  # m, of the cylinders that a tapered segment is made of
-
-# Transmission matrix of a tube: (p, Q) at its inlet from those at its outlet, as the
-# entries a, b, c, d, each of shape (h,) over harmonics.
-Transmission = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+NUM_HARMONICS = 60
 
 
 def make_network(
@@ -47,16 +45,17 @@ def make_network(
     viscosity: float = 0.0,
     friction: float = 0.0,
     resistance: tuple[float, float] = (1e8, 1e9),
-    outflow_pressure: float = REST,
 ) -> Network:
     """Return tubes between nodes, all with the same walls and outlets."""
     num = len(nodes)
+    inlet_node, outlet_node = np.array(nodes).T
+    inlet_radius, outlet_radius = np.array(radius).T
     return Network(
-        inlet_node=np.array([node[0] for node in nodes]),
-        outlet_node=np.array([node[1] for node in nodes]),
+        inlet_node=inlet_node,
+        outlet_node=outlet_node,
         length=np.array(length),
-        inlet_radius=np.array([pair[0] for pair in radius]),
-        outlet_radius=np.array([pair[1] for pair in radius]),
+        inlet_radius=inlet_radius,
+        outlet_radius=outlet_radius,
         stiffness=np.array([[0.0] * num, [0.0] * num, [6e4] * num]),
         wall_viscosity=np.array([[viscosity] * num, [0.0] * num]),
         reference_pressure=np.full(num, REST),
@@ -68,68 +67,65 @@ def make_network(
             proximal_resistance=np.full(len(outlets), resistance[0]),
             distal_resistance=np.full(len(outlets), resistance[1]),
             compliance=np.full(len(outlets), 1e-9),
-            pressure=outflow_pressure,
+            pressure=REST,
         ),
     )
 
 
-def linear_pressure(
+def run(
+    network: Network,
+    inflow: np.ndarray,
+    period: float,
+    *,
+    pressure: float = REST,
+    **changes: Any,
+) -> Flow:
+    """Solve with usual settings, from a network that is at rest at a pressure."""
+    options: dict[str, Any] = {
+        "sites": [(0, 0.5)],
+        "start_pressure": pressure,
+        "stored_pressure": np.full(len(network.outlets.segment), pressure),
+        "cell_length": 0.01,
+        "courant": 0.6,
+        "num_cycles": 3,
+        "convection": 4 / 3,
+    }
+    return solve(network, inflow, period, **(options | changes))
+
+
+def small_wave_error(
     network: Network,
     inflow: np.ndarray,
     period: float,
     *,
     pressure: float,
     sites: list[tuple[int, float]],
-    num_harmonics: int,
-) -> np.ndarray:
-    r"""Return pressure waves around a state of rest.
+    **changes: Any,
+) -> float:
+    r"""Return the difference from the exact small waves, as a share of their rms.
 
-    In a cylinder the equations of blood flow, linearised around rest at a uniform
-    pressure, are those of an electric line with, per length,
+    It is the largest over the sites. In a cylinder the equations of blood flow,
+    linearised around rest at a uniform pressure, are those of an electric line with,
+    per length,
 
     .. math:: Z = \frac{\rho}{A} \left(i \omega + \frac{f}{A}\right), \qquad
         Y = \frac{i \omega C}{1 + i \omega \tau}, \qquad
         C = \frac{2 \sqrt A}{\beta / A_d}, \quad \tau = \frac{2 \Gamma}{\beta}
 
     Pressures at nodes follow from the balance of flows: inflow, Windkessels and the
-    admittances of all segments.
-
-    Returns:
-        Deviation of the pressure from the one at rest at each of the sites, at the
-        times of the inflow, in Pa, shape ``(r, n)``.
+    admittances of all segments. The inflow must be small.
     """
-    spectrum = np.fft.rfft(inflow)[1 : num_harmonics + 1]
-    omega = 2 * np.pi / period * np.arange(1, len(spectrum) + 1)
-    num_segments = len(network.length)
-    lines = [
-        _transmission(network, k, 1.0, omega, pressure) for k in range(num_segments)
-    ]
-    nodal = _node_pressures(network, lines, spectrum, omega)
-    waves = []
-    for segment, position in sites:
-        inlet = nodal[:, network.inlet_node[segment]]
-        outlet = nodal[:, network.outlet_node[segment]]
-        a, b, c, d = lines[segment]
-        flow_out = (inlet - a * outlet) / b
-        flow_in = c * outlet + d * flow_out
-        _, b, _, d = _transmission(network, segment, position, omega, pressure)
-        coefficients = np.zeros(len(inflow) // 2 + 1, dtype=complex)
-        coefficients[1 : len(spectrum) + 1] = d * inlet - b * flow_in
-        waves.append(np.fft.irfft(coefficients, len(inflow)))
-    return np.stack(waves)
-
-
-def _node_pressures(
-    network: Network,
-    lines: list[Transmission],
-    spectrum: np.ndarray,
-    omega: np.ndarray,
-) -> np.ndarray:
-    """Return the harmonics of the pressure at all nodes, shape (h, nodes)."""
+    changes |= {"pressure": pressure, "sites": sites, "convection": 0.0}
+    inflow = inflow - inflow.mean()
+    flow = run(network, inflow, period, **changes)
+    waves = flow.at(np.arange(len(inflow)) / len(inflow))
+    spectrum = np.fft.rfft(inflow)[1 : NUM_HARMONICS + 1]
+    omega = 2 * np.pi / period * np.arange(1, NUM_HARMONICS + 1)
     num_nodes, outlets = network.num_nodes, network.outlets
-    admittance = np.zeros((len(omega), num_nodes, num_nodes), dtype=complex)
-    for k, (a, b, c, d) in enumerate(lines):
-        i, j = network.inlet_node[k], network.outlet_node[k]
+    admittance = np.zeros((NUM_HARMONICS, num_nodes, num_nodes), dtype=complex)
+    ends = list(zip(network.inlet_node, network.outlet_node, strict=True))
+    lines = [_transmission(network, k, 1.0, omega, pressure) for k in range(len(ends))]
+    for (i, j), ((a, b), (c, d)) in zip(ends, lines, strict=True):
         admittance[:, i, i] += d / b
         admittance[:, i, j] += c - d * a / b
         admittance[:, j, i] -= 1 / b
@@ -139,60 +135,58 @@ def _node_pressures(
         behind = distal / (1 + 1j * omega * distal * outlets.compliance[n])
         node = network.outlet_node[segment]
         admittance[:, node, node] += 1 / (outlets.proximal_resistance[n] + behind)
-    source = np.zeros((len(omega), num_nodes, 1), dtype=complex)
+    source = np.zeros((NUM_HARMONICS, num_nodes, 1), dtype=complex)
     source[:, network.source_node, 0] = spectrum
-    return np.linalg.solve(admittance, source)[:, :, 0]
+    nodal = np.linalg.solve(admittance, source)[:, :, 0]
+    exact = []
+    for segment, position in sites:
+        inlet, outlet = (nodal[:, node] for node in ends[segment])
+        (a, b), (c, d) = lines[segment]
+        flow_in = c * outlet + d * (inlet - a * outlet) / b
+        (_, b), (_, d) = _transmission(network, segment, position, omega, pressure)
+        coefficients = np.zeros(len(inflow) // 2 + 1, dtype=complex)
+        coefficients[1 : NUM_HARMONICS + 1] = d * inlet - b * flow_in
+        exact.append(np.fft.irfft(coefficients, len(inflow)))
+    return float(((waves - exact).std(axis=1) / np.std(exact, axis=1)).max())
 
 
 def _transmission(
-    network: Network,
-    segment: int,
-    stop: float,
-    omega: np.ndarray,
-    pressure: float,
-) -> Transmission:
-    """Return the matrix of a segment up to a place, as a chain of short cylinders."""
+    network: Network, segment: int, stop: float, omega: np.ndarray, pressure: float
+) -> np.ndarray:
+    """Return the matrix, (2, 2, h), of a segment up to a place.
+
+    It makes pressure and flow at the inlet from those at the place, by a chain of short
+    cylinders.
+    """
     length = stop * network.length[segment]
     num = max(int(np.ceil(length / PIECE_LENGTH)), 1)
-    radii = network.radius(segment, stop * (np.arange(num) + 0.5) / num)
     total = np.broadcast_to(np.eye(2, dtype=complex), (len(omega), 2, 2))
-    for radius in radii:
+    for radius in network.radius(segment, stop * (np.arange(num) + 0.5) / num):
         slope = network.tube_law(segment, radius)
         reference = network.reference_pressure[segment]
         root = np.sqrt(np.pi) * radius + (pressure - reference) / slope
-        compliance = 2 * root / slope
         relaxation = 2 * network.viscosity(segment, radius) / slope
         relaxation /= np.pi * radius**2
         friction = network.friction[segment] / root**2
         series = network.density / root**2 * (1j * omega + friction)
-        shunt = 1j * omega * compliance / (1 + 1j * omega * relaxation)
+        shunt = 1j * omega * 2 * root / slope / (1 + 1j * omega * relaxation)
         impedance = np.sqrt(series / shunt)
         phase = np.sqrt(series * shunt) * length / num
-        piece = np.empty((len(omega), 2, 2), dtype=complex)
-        piece[:, 0, 0] = piece[:, 1, 1] = np.cosh(phase)
-        piece[:, 0, 1] = impedance * np.sinh(phase)
-        piece[:, 1, 0] = np.sinh(phase) / impedance
-        total = total @ piece
-    return total[:, 0, 0], total[:, 0, 1], total[:, 1, 0], total[:, 1, 1]
+        cosh, sinh = np.cosh(phase), np.sinh(phase)
+        piece = np.array([[cosh, impedance * sinh], [sinh / impedance, cosh]])
+        total = total @ np.moveaxis(piece, 2, 0)
+    return np.moveaxis(total, 0, 2)
 
 
 # openBF ------------------------------------------------------------------------------
-
-POISSON_RATIO = 0.5
-# Thickness of walls that have none: h = R (a exp(b R) + c exp(d R)).
-THICKNESS = (0.2802, -505.3, 0.1324, -11.14)
 
 
 def openbf_error(folder: Path, case: str, *, cell_length: float = 0.01) -> float:
     """Return the difference from openBF, in % of the mean pressure.
 
     It is the root mean square over the last beat in the middle of a vessel, averaged
-    over vessels. Both start from an empty network and simulate as many beats.
-
-    Args:
-        folder: Where ``<case>.yaml``, ``<case>_inlet.dat`` and ``ref_<case>.npz`` are.
-        case: ``"cca"``, ``"ibif"`` or ``"adan56"``.
-        cell_length: Length of a cell, in m.
+    over vessels. Both start from an empty network and simulate as many beats. The case
+    is ``"cca"``, ``"ibif"`` or ``"adan56"``.
     """
     text = (folder / f"{case}.yaml").read_text()
     inflow_time, inflow = np.loadtxt(folder / f"{case}_inlet.dat").T
@@ -205,15 +199,14 @@ def openbf_error(folder: Path, case: str, *, cell_length: float = 0.01) -> float
     period = inflow_time[-1]
     num_cycles = round(waves[0][-1, 0] / period)
     network = openbf_network(vessels, text)
-    flow = solve(
+    flow = run(
         network,
         np.interp(np.arange(2000) / 2000 * period, inflow_time, inflow),
         period,
         sites=[(segment, 0.5) for segment in range(len(vessels))],
-        start_pressure=float(network.reference_pressure[0]),
+        pressure=float(network.reference_pressure[0]),
         stored_pressure=np.zeros(len(network.outlets.segment)),
         cell_length=cell_length,
-        courant=0.6,
         num_cycles=num_cycles,
         convection=1.0,
     )
@@ -227,7 +220,7 @@ def openbf_network(vessels: list[dict[str, str]], text: str) -> Network:
     r"""Return the network of a case.
 
     Walls follow :math:`p = p_{ext} + \beta (\sqrt{A / A_0} - 1)` with :math:`\beta =
-    \sqrt{\pi / A_0} h_0 E / (1 - \sigma^2)`, which is the tube law of
+    \sqrt{\pi / A_0} h_0 E / (1 - 0.5^2)`, which is the tube law of
     :class:`Network`. The taper of version 2 of openBF multiplies by the length of a
     cell twice and so has no effect: vessels are cylinders of their proximal radius.
     """
@@ -238,11 +231,11 @@ def openbf_network(vessels: list[dict[str, str]], text: str) -> Network:
     blood = dict(re.findall(r"^\s+(rho|mu):\s*(\S+)", text, flags=re.M))
     density, viscosity = float(blood["rho"]), float(blood["mu"])
     radius = np.array([float(v.get("Rp", v.get("R0", "nan"))) for v in vessels])
-    a, b, c, d = THICKNESS
-    thickness = radius * (a * np.exp(b * radius) + c * np.exp(d * radius))
-    thickness = np.where(column("h0") > 0, column("h0"), thickness)
-    # beta of the tube law is 4/3 sqrt(pi) E h: the factor is in 1 / (1 - sigma^2).
-    stiffness = 0.75 * column("E") * thickness / (1 - POISSON_RATIO**2)
+    # Thickness of walls that have none.
+    usual = 0.2802 * np.exp(-505.3 * radius) + 0.1324 * np.exp(-11.14 * radius)
+    thickness = np.where(column("h0") > 0, column("h0"), radius * usual)
+    # beta of the tube law is 4/3 sqrt(pi) E h: the factor is in 1 / (1 - 0.5^2).
+    stiffness = column("E") * thickness
     zeros = np.zeros(len(vessels))
     source = set(column("sn").astype(int)) - set(column("tn").astype(int))
     segment = np.flatnonzero(column("Cc") > 0)

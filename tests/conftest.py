@@ -67,12 +67,3 @@ def rough_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 def chamber_extract() -> Path:
     """Folder with the first rows of recorded experiments, see ``tests/data``."""
     return TEST_DATA / "causal_chamber"
-
-
-@pytest.fixture(scope="session")
-def chamber_root() -> Path:
-    """Return the folder with the whole causal chamber data sets, or skip."""
-    root = SHARED_DATA / "causal_chamber"
-    if not root.is_dir():
-        pytest.skip("the causal chamber data are not on this machine")
-    return root

@@ -594,13 +594,13 @@ FAULTS = [
         "Hearts eject a tenth less than their stroke volume",
         "tasks.hemodynamics.inflow:aortic_inflow",
         result(lambda flow: 0.9 * flow),
-        "unit/test_hemodynamics_inflow.py",
+        "unit/test_hemodynamics_network.py",
     ),
     Fault(
         "Recordings begin in the first half of a beat",
         "tasks.hemodynamics.records:play",
         argument(start=lambda start: start / 2),
-        "unit/test_tasks_hemodynamics.py",
+        "unit/test_hemodynamics_records.py",
     ),
     Fault(
         "The light through two polarisers falls with the cosine",
@@ -628,7 +628,7 @@ FAULTS = [
                 right(seed + 1, "calibration") if use == "test" else right(seed, use)
             )
         ),
-        "unit/test_tasks_splits.py",
+        "unit/test_tasks_base.py",
     ),
     Fault(
         "Recorded calibration pairs are test pairs as well",
@@ -636,7 +636,7 @@ FAULTS = [
         lambda right: (
             lambda self, part: sorted({*right(self, "calibration"), *right(self, part)})
         ),
-        "unit/test_tasks_splits.py",
+        "unit/test_tasks_base.py",
     ),
     Fault(
         "Biased calibration parameters crowd half as much",

@@ -68,19 +68,15 @@ def same_rows(a: Tensor, b: Tensor) -> int:
     return sum(row in rows for row in rows_of(b))
 
 
-def coarse(x: Tensor) -> Tensor:
-    """Entries of x; of images, those of a coarser one."""
-    if x.ndim == 4:
-        x = torch.nn.functional.adaptive_avg_pool2d(x, 4)
-    return x.flatten(1).double()
-
-
 def largest_z(a: Tensor, b: Tensor, *, paired: bool = False) -> float:
     """Largest difference between means and variances of entries, in standard errors.
 
-    Paired rows belong to the same parameters, whose scatter is then left out.
+    Paired rows belong to the same parameters, whose scatter is then left out. Images
+    are made coarser first.
     """
-    a, b = coarse(a), coarse(b)
+    if a.ndim == 4:
+        a, b = (torch.nn.functional.adaptive_avg_pool2d(x, 4) for x in (a, b))
+    a, b = a.flatten(1).double(), b.flatten(1).double()
     centre = (a.mean(dim=0) + b.mean(dim=0)) / 2
     a, b = (torch.cat([x, (x - centre) ** 2], dim=1) for x in (a, b))
     error = (a.var(dim=0) / len(a) + b.var(dim=0) / len(b)).sqrt()
@@ -88,3 +84,10 @@ def largest_z(a: Tensor, b: Tensor, *, paired: bool = False) -> float:
         error = ((a - b).var(dim=0) / len(a)).sqrt()
     difference = (a.mean(dim=0) - b.mean(dim=0)).abs()
     return float((difference / error)[difference > 0].max())
+
+
+def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Write a table of a recording, in a folder that need not be there yet."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = [",".join(rows[0]), *(",".join(map(str, row.values())) for row in rows)]
+    path.write_text("\n".join(lines) + "\n")

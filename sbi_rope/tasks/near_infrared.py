@@ -81,11 +81,11 @@ class NearInfraredSimulator(Settings):
         """Simulate ``theta`` of shape ``(n, 3)``, to shape ``(n, 100)``."""
         theta = as_batch("theta", theta, (3,), empty=True)
         low, high = PATHS
-        path = low + (high - low) * torch.rand(len(theta), 1).to(theta)
-        slope = -0.05 + self.slope_std * torch.randn(len(theta), 1).to(theta)
+        path = low + (high - low) * theta.new_empty(len(theta), 1).uniform_()
+        slope = -0.05 + self.slope_std * theta.new_empty(len(theta), 1).normal_()
         absorption = path * (theta / 100) @ spectra().to(theta) / np.log(10)
         tilt = (theta.new_tensor(WAVELENGTHS) - 950) / 100
-        noise = self.noise_std * torch.randn(absorption.shape).to(theta)
+        noise = self.noise_std * torch.randn_like(absorption)
         return standardised(absorption + slope * tilt + noise)
 
 

@@ -66,8 +66,8 @@ class OceanColourSimulator(Settings):
         theta = as_batch("theta", theta, (2,), empty=True)
         log_c, log_g = theta[:, :1], theta[:, 1:]
         bands, c = theta.new_tensor(BANDS), 10**log_c
-        algae, particles = 10 ** (self.scatter * torch.randn(2, *c.shape).to(theta))
-        slope = 0.015 + 0.002 * torch.randn(c.shape).to(theta)
+        algae, particles = 10 ** (self.scatter * c.new_empty(2, *c.shape).normal_())
+        slope = 0.015 + 0.002 * c.new_empty(c.shape).normal_()
         absorption = (
             theta.new_tensor(WATER_ABSORPTION)
             + 0.06 * c**0.65 * algae * theta.new_tensor(ALGAE_ABSORPTION)
@@ -82,7 +82,7 @@ class OceanColourSimulator(Settings):
         u = scattering / (absorption + scattering)
         below = LINEAR * u + QUADRATIC * u.square()
         reflectance = THROUGH * below / (1 - REFLECTED * below)
-        noise = 1 + self.relative_noise * torch.randn(reflectance.shape).to(theta)
+        noise = 1 + self.relative_noise * torch.randn_like(reflectance)
         return (reflectance * noise.clamp(min=0.1)).log10()
 
 

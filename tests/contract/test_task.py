@@ -1,16 +1,13 @@
 """What every task promises of its prior, its simulator and its network.
 
-Its labelled sets are in ``test_task_sets.py``, the variants that all tasks have in
-``test_task_variants.py``. Bad
-arguments of the simulators are tried in ``tests/integration/test_bad_inputs.py``.
+Its labelled sets are in ``test_task_sets.py``, bad arguments of the simulators in
+``tests/integration/test_bad_inputs.py``.
 """
 
 import copy
 import math
 import pickle
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import pytest
 import torch
@@ -23,18 +20,14 @@ from tests.tasks import as_many, make, same_rows
 
 # Priors that reach everywhere.
 UNBOUNDED = {"linear_gaussian"}
+STANDARD = [(name, None) for name in sorted(TASKS)]
 # Variants with a prior of their own.
 OTHER_PRIORS = [
     ("light_tunnel_sensors", "strong_colours"),
     ("light_tunnel_sensors", "strong_angles"),
 ]
-
-TASK = pytest.mark.parametrize(
-    "kind", [(name, None) for name in sorted(TASKS)], ids=str
-)
-PRIOR = pytest.mark.parametrize(
-    "kind", [*((name, None) for name in sorted(TASKS)), *OTHER_PRIORS], ids=str
-)
+TASK = pytest.mark.parametrize("kind", STANDARD, ids=str)
+PRIOR = pytest.mark.parametrize("kind", [*STANDARD, *OTHER_PRIORS], ids=str)
 
 
 @pytest.fixture
@@ -42,51 +35,43 @@ def task(kind: tuple[str, str | None]) -> Task:
     return make(kind[0], variant=kind[1])
 
 
-@contextmanager
-def default_dtype(dtype: torch.dtype) -> Iterator[None]:
-    torch.set_default_dtype(dtype)
-    try:
-        yield
-    finally:
-        torch.set_default_dtype(torch.float32)
-
-
-# The prior ---------------------------------------------------------------------------
-
-
 @TASK
 def test_the_description_has_an_entry_for_every_parameter_and_variant(
     task: Task,
 ) -> None:
-    assert task.name in TASKS
+    assert TASKS[task.name] is type(task)
     assert len(task.parameter_names) == len(task.parameter_units) == task.theta_dim
     assert len(set(task.parameter_names)) == task.theta_dim
     assert task.prior_std.shape == (task.theta_dim,)
     assert len(task.x_names) in (0, *task.x_shape)
-    assert len(task.misspecification) > 20
     assert set(COMMON_VARIANTS) <= set(task.variants)
-    assert all(len(sentence) > 20 for sentence in task.variants.values())
     assert set(task.shifted_region) <= set(task.parameter_names)
 
 
 @PRIOR
 def test_sbi_takes_the_prior_and_its_float32_draws_as_they_are(task: Task) -> None:
+    before = torch.get_rng_state()
     prior = task.get_prior()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         processed, theta_dim, returns_numpy = process_prior(prior)
     assert processed is prior
-    assert theta_dim == task.theta_dim
-    assert not returns_numpy
-    assert prior.event_shape == (task.theta_dim,)
+    assert (theta_dim, returns_numpy) == (task.theta_dim, False)
+    torch.set_rng_state(before)
+    assert task.get_prior() is not prior
+    assert torch.equal(before, torch.get_rng_state())
     theta = prior.sample(torch.Size((1000,)))
     assert theta.shape == (1000, task.theta_dim)
-    assert theta.dtype == torch.float32
     assert within_support(prior, theta).all()
     log_prob = prior.log_prob(theta)
     assert torch.isfinite(log_prob).all()
     for copied in (copy.deepcopy(prior), pickle.loads(pickle.dumps(prior))):
         torch.testing.assert_close(copied.log_prob(theta), log_prob)
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert task.get_prior().sample().dtype == theta.dtype == torch.float32
+    finally:
+        torch.set_default_dtype(torch.float32)
 
 
 @pytest.mark.medium
@@ -132,34 +117,15 @@ ANALYTIC: dict[str, tuple[list[list[float]], list[float]]] = {
     ),
     "pendulum": ([[0.1, 1.0]], [-math.log(28.5)]),
     "sir": ([[0.4, 0.1]], [math.log(8)]),
-    "wind_tunnel": ([[22.5]], [-math.log(45)]),
+    # Torch's uniform laws exclude their upper end, where recorded parameters lie.
+    "wind_tunnel": ([[22.5], [45.0]], [-math.log(45)] * 2),
 }
 
 
-@pytest.mark.parametrize("name", ANALYTIC)
-def test_the_density_of_the_prior_is_that_of_the_paper(name: str) -> None:
-    theta, expected = ANALYTIC[name]
-    log_prob = make(name).get_prior().log_prob(torch.tensor(theta))
-    assert log_prob.tolist() == pytest.approx(expected, rel=1e-5)
-
-
-@pytest.mark.medium
-@TASK
-def test_the_parts_of_a_task_are_new_each_time_and_making_them_draws_nothing(
-    task: Task,
-) -> None:
-    before = torch.get_rng_state()
-    assert task.get_prior() is not task.get_prior()
-    task.get_simulator()
-    assert task.prior_std is not None
-    assert torch.equal(before, torch.get_rng_state())
-    with default_dtype(torch.float64):
-        assert task.get_prior().sample().dtype == torch.float32
-        theta = task.get_prior().sample(torch.Size((2,)))
-        assert task.get_simulator()(theta).dtype == torch.float32
-
-
-# The simulator and the network -------------------------------------------------------
+def test_the_density_of_the_prior_is_that_of_the_paper() -> None:
+    for name, (theta, expected) in ANALYTIC.items():
+        log_prob = make(name).get_prior().log_prob(torch.tensor(theta))
+        assert log_prob.tolist() == pytest.approx(expected, rel=1e-5)
 
 
 @pytest.mark.medium
@@ -176,10 +142,10 @@ def test_the_simulator_returns_finite_batches_of_any_size(task: Task) -> None:
 
 @TASK
 def test_the_noise_of_the_simulator_follows_the_global_seed(task: Task) -> None:
-    simulator, theta = task.get_simulator(), task.get_prior().sample((3,))
+    theta = task.get_prior().sample((1,)).expand(2, -1)
+    simulator = task.get_simulator()
     draws = []
     for some, seed in (
-        (simulator, 1),
         (simulator, 1),
         (pickle.loads(pickle.dumps(simulator)), 1),
         (simulator, 2),
@@ -187,10 +153,8 @@ def test_the_noise_of_the_simulator_follows_the_global_seed(task: Task) -> None:
         torch.manual_seed(seed)
         draws.append(some(theta))
     assert torch.equal(draws[0], draws[1])
-    assert torch.equal(draws[0], draws[2])
-    assert not torch.equal(draws[0], draws[3])
-    first, second = simulator(theta[:1].expand(2, -1))
-    assert not torch.equal(first, second)
+    assert not torch.equal(draws[0], draws[2])
+    assert not torch.equal(*draws[0])
 
 
 @pytest.mark.medium
@@ -201,16 +165,13 @@ def test_embedding_nets_are_new_and_use_all_of_their_parameters(task: Task) -> N
     for light in (True, False):
         net, other = (task.get_embedding_net(light=light) for _ in range(2))
         statistics = net(x)
-        assert statistics.ndim == 2
-        assert len(statistics) == 50
+        assert (statistics.ndim, len(statistics)) == (2, 50)
+        assert not torch.equal(statistics, other(x))
         statistics.square().sum().backward()
         for name, parameter in net.named_parameters():
             assert parameter.grad is not None, name
             assert parameter.grad.abs().sum() > 0, name
-        pairs = list(zip(net.parameters(), other.parameters(), strict=True))
-        assert all(p is not q for p, q in pairs)
-        assert any(not torch.equal(p, q) for p, q in pairs)
-        sizes.append(sum(p.numel() for p, _ in pairs))
+        sizes.append(sum(p.numel() for p in net.parameters()))
     assert sizes[0] <= sizes[1]
 
 
@@ -220,7 +181,6 @@ def test_simulations_to_train_on_are_a_prefix_of_more_and_share_nothing_with_the
     task: Task,
 ) -> None:
     theta, x = task.get_simulations(150, seed=1)
-    assert theta.shape == (150, task.theta_dim)
     assert x.shape == (150, *task.x_shape)
     assert within_support(task.get_prior(), theta).all()
     few = task.get_simulations(7, seed=1)

@@ -1,17 +1,14 @@
 """The labelled sets of every task: reproducible, disjoint, of the law they should have.
 
-All sets are made by the same code, which ``tests/unit/test_tasks_splits.py`` tests. The
-contract is checked for the standard process of every task, and for the variants that
-run code of a task's own. One task with a process to draw from and one with recordings
-stand for the others in the variants that all tasks have.
-
-Sets are drawn once for all tests that read them (:func:`shared`); what must be
-reproduced is drawn anew and compared with them.
+All sets are made by the same code, which ``tests/unit/test_tasks_base.py`` tests. The
+contract is checked for the standard process of every task, for the one that is the
+simulator, and for the variants that run code of a task's own. One task with a process
+to draw from and one with recordings stand for the others in the variants that all tasks
+have.
 """
 
-import functools
 import random
-from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -22,6 +19,7 @@ from torch import Tensor
 from sbi_rope.tasks import TASKS, Task
 from sbi_rope.tasks.variants import COMMON_VARIANTS
 from tests.tasks import (
+    MEASURED,
     SUBTLE,
     as_many,
     draw,
@@ -33,71 +31,40 @@ from tests.tasks import (
 
 # Variants whose calibration set follows another law than the test set.
 ANOTHER_CALIBRATION_LAW = {"biased_calibration", "sensor_settings", "flipped"}
-# Variants that all tasks have, for which a task runs code of its own.
-OWN_CODE = {("light_tunnel", "biased_calibration"), ("hemodynamics", "well_specified")}
-# One process that is drawn and one that is recorded.
-FOR_THE_REST = {"pendulum", "light_tunnel_sensors"}
-# Tasks whose real process takes a tenth of a second for some hundred observations.
-SLOW_PROCESS = {"cs", "light_tunnel", "sir"}
-
-
-def runs_code_of_its_own(name: str, variant: str | None) -> bool:
-    """Whether no other task's tests run what this variant of this task runs."""
-    is_common = variant in COMMON_VARIANTS and name not in FOR_THE_REST
-    return not is_common or (name, variant) in OWN_CODE
-
-
-def kinds(*more: str) -> pytest.MarkDecorator:
-    return pytest.mark.parametrize(
-        ("name", "variant"),
-        [
-            pytest.param(name, variant, id=f"{name}-{variant or 'standard'}")
-            for name, task in TASKS.items()
-            for variant in (None, *task.variants)
-            if runs_code_of_its_own(name, variant) or variant in more
-        ],
-    )
-
-
-KINDS = kinds()
+# One process that is drawn, one that is recorded, and one with bias of its own.
+FOR_THE_REST = {"pendulum", "light_tunnel_sensors", "light_tunnel"}
 PARTS = ("calibration", "test")
+# Two blocks of a drawn set or more. 400 observations tell a process that differs from
+# the simulator by 13 standard errors or more.
+SIZES = {("calibration", 0): 250, ("test", 0): 400} | {(part, 1): 130 for part in PARTS}
+KINDS = [
+    (name, variant)
+    for name, task in TASKS.items()
+    for variant in (None, *task.variants)
+    if variant == "well_specified"
+    or variant not in COMMON_VARIANTS
+    or name in FOR_THE_REST
+]
+EVERY_TASK = pytest.mark.parametrize("name", sorted(TASKS))
 
 
-@pytest.fixture
-def labelled(name: str, variant: str | None) -> Task:
-    return make(name, variant=variant)
+@dataclass(frozen=True)
+class Drawn:
+    """A task and two sets of each part, for all tests to read."""
+
+    task: Task
+    sets: dict[tuple[str, int], tuple[Tensor, Tensor]]
 
 
-def size_of(task: Task, part: str, seed: int) -> int:
-    """Number of observations in a shared set; two blocks of a drawn one or more."""
-    if seed != 0:
-        return as_many(130, task, part, seed=seed)
-    if part == "calibration":
-        return as_many(250, task, part)
-    # Where the process differs from the simulator, 400 observations tell by 13 standard
-    # errors or more. To tell that it does not takes as many as there is time for.
-    few = task.name in SLOW_PROCESS and task.variant != "well_specified"
-    return as_many(400 if few else 1000, task, part)
-
-
-@functools.cache
-def _drawn(name: str, variant: str | None, part: str, seed: int) -> tuple[Tensor, ...]:
+@pytest.fixture(scope="module", params=KINDS, ids=str)
+def drawn(request: pytest.FixtureRequest) -> Drawn:
+    name, variant = request.param
     task = make(name, variant=variant)
-    with torch.random.fork_rng():
-        torch.manual_seed(1)
-        return draw(task, part, size_of(task, part, seed), seed=seed)
-
-
-def shared(task: Task, part: str, *, seed: int = 0) -> tuple[Tensor, ...]:
-    """Return a set that all tests share; for reading only."""
-    return _drawn(task.name, task.variant, part, seed)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _forget() -> Iterator[None]:
-    """Let go of the shared sets after the last test."""
-    yield
-    _drawn.cache_clear()
+    sets = {
+        (part, seed): draw(task, part, as_many(n, task, part, seed=seed), seed=seed)
+        for (part, seed), n in SIZES.items()
+    }
+    return Drawn(task, sets)
 
 
 def state_of_all_generators() -> list[bytes]:
@@ -109,84 +76,127 @@ def state_of_all_generators() -> list[bytes]:
 
 
 @pytest.mark.medium
-@KINDS
 def test_sets_have_the_shapes_asked_for_and_no_observation_in_common(
-    labelled: Task,
+    drawn: Drawn,
 ) -> None:
-    prior = labelled.get_prior()
-    for part in PARTS:
-        theta, x = shared(labelled, part)
-        n = size_of(labelled, part, 0)
-        assert theta.shape == (n, labelled.theta_dim)
-        assert x.shape == (n, *labelled.x_shape)
+    task = drawn.task
+    prior = task.get_prior()
+    for (part, seed), (theta, x) in drawn.sets.items():
+        n = as_many(SIZES[part, seed], task, part, seed=seed)
+        assert theta.shape == (n, task.theta_dim)
+        assert x.shape == (n, *task.x_shape)
         assert theta.dtype == x.dtype == torch.float32
         assert torch.isfinite(x).all()
         assert within_support(prior, theta).all()
         assert len(set(rows_of(x))) == len(x)
+        # A caller's draws under the same seed share nothing with the set either.
+        torch.manual_seed(seed)
+        assert same_rows(prior.sample(torch.Size((1000,))), theta) == 0
     for one, other in ((0, 0), (0, 1), (1, 0)):
-        calibration = shared(labelled, "calibration", seed=one)
-        test = shared(labelled, "test", seed=other)
+        calibration, test = (
+            drawn.sets[p, s] for p, s in zip(PARTS, (one, other), strict=True)
+        )
         assert same_rows(calibration[1], test[1]) == 0
         assert same_rows(calibration[0], test[0]) <= 0.01 * len(test[0])
-    # Nor do the draws that a caller makes under the same seed.
-    for seed in (0, 1):
-        torch.manual_seed(seed)
-        theta = prior.sample(torch.Size((1000,)))
-        for part in PARTS:
-            assert same_rows(theta, shared(labelled, part, seed=seed)[0]) == 0
 
 
 @pytest.mark.medium
-@KINDS
 def test_a_set_depends_on_nothing_but_its_seed_and_leaves_no_trace(
-    labelled: Task, capfd: pytest.CaptureFixture[str]
+    drawn: Drawn,
 ) -> None:
     for part in PARTS:
-        expected, other = shared(labelled, part), shared(labelled, part, seed=1)
+        expected, other = (drawn.sets[part, seed] for seed in (0, 1))
         for a, b in zip(expected, other, strict=True):
             assert not torch.equal(a[:20], b[:20])
-        torch.manual_seed(2)
         before = state_of_all_generators()
-        small = draw(labelled, part, 7)
-        again = draw(labelled, part, np.int64(7), seed=np.uint8(1))
+        # Integers of NumPy would overflow in the numbers of random streams.
+        again = draw(drawn.task, part, np.int64(7), seed=np.uint8(1))
         assert state_of_all_generators() == before
         torch.set_default_dtype(torch.float64)
         try:
             with torch.device("meta"):
-                elsewhere = draw(labelled, part, 7)
+                elsewhere = draw(drawn.task, part, 7)
         finally:
             torch.set_default_dtype(torch.float32)
-        for found, whole in ((small, expected), (again, other), (elsewhere, expected)):
+        for found, whole in ((again, other), (elsewhere, expected)):
             assert all(torch.equal(a, b[:7]) for a, b in zip(found, whole, strict=True))
-    assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.medium
-@KINDS
 def test_calibration_and_test_sets_follow_one_law_unless_the_variant_says_otherwise(
-    labelled: Task, variant: str | None
+    drawn: Drawn,
 ) -> None:
-    calibration, test = (shared(labelled, part) for part in PARTS)
+    calibration, test = (drawn.sets[part, 0] for part in PARTS)
     same = [largest_z(a, b) < 4.5 for a, b in zip(calibration, test, strict=True)]
-    if variant not in ANOTHER_CALIBRATION_LAW:
+    if drawn.task.variant not in ANOTHER_CALIBRATION_LAW:
         # Noise on the labels of the calibration set leaves the observations alone.
         assert same[1]
-        assert same[0] or variant == "noisy_labels"
+        assert same[0] or drawn.task.variant == "noisy_labels"
     elif len(calibration[0]) >= 100:
         assert not all(same)
 
 
 @pytest.mark.medium
-@kinds("well_specified")
 def test_real_observations_follow_the_simulator_only_where_the_variant_says_so(
-    labelled: Task, variant: str | None
+    drawn: Drawn,
 ) -> None:
-    theta, x_o = shared(labelled, "test")
-    simulator = labelled.get_simulator()
-    x_s = simulator(theta)
-    if variant is None:
-        assert largest_z(x_s, simulator(theta), paired=True) < 4.5
-    if variant == "well_specified":
+    theta, x_o = drawn.sets["test", 0]
+    x_s = drawn.task.get_simulator()(theta)
+    if drawn.task.variant == "well_specified":
+        assert drawn.task.required_files == ()
         assert largest_z(x_s, x_o, paired=True) < 4.5
-    elif labelled.name not in SUBTLE:
+    elif drawn.task.name not in SUBTLE:
         assert largest_z(x_s, x_o, paired=True) > 6.0
+
+
+# The variants that every task has ----------------------------------------------------
+
+
+@EVERY_TASK
+def test_shifted_parameters_stay_in_the_region(name: str) -> None:
+    task = make(name, variant="prior_shift")
+    for part in PARTS:
+        theta, _ = draw(task, part, as_many(100, task, part) // 3)
+        for parameter, (low, high) in task.shifted_region.items():
+            values = theta[:, task.parameter_names.index(parameter)]
+            assert ((values >= low) & (values <= high)).all()
+
+
+@pytest.mark.medium
+@EVERY_TASK
+def test_biased_calibration_parameters_crowd_in_the_middle(name: str) -> None:
+    task = make(name, variant="biased_calibration")
+    spread, margin = [], []
+    for part in PARTS:
+        n = as_many(200, task, part)
+        theta, _ = draw(task, part, n)
+        spread.append(task.prior_quantiles(theta)[:, :3].std(dim=0))
+        margin.append(0.5 / n**0.5)
+    # Standard deviations of Beta(3, 3) and of the uniform law, and a margin of three
+    # standard errors or more. Parameters of the sea or of meat never follow a prior.
+    assert (spread[0] < 0.189 + margin[0]).all()
+    if name not in MEASURED:
+        assert (spread[1] > 0.289 - margin[1]).all()
+
+
+@pytest.mark.medium
+@EVERY_TASK
+def test_noisy_labels_belong_to_the_observations_of_the_standard_task(
+    name: str,
+) -> None:
+    clean = make(name)
+    n = as_many(200, clean, "calibration")
+    theta, x = clean.get_calibration_set(n)
+    spread = {}
+    for noise in (None, 0.001):
+        noisy = make(name, variant="noisy_labels", label_noise=noise)
+        noisy_theta, same_x = noisy.get_calibration_set(n)
+        assert torch.equal(x, same_x)
+        spread[noise] = ((noisy_theta - theta) / clean.prior_std).std(dim=0)
+    sets = (task.get_test_set(40) for task in (clean, noisy))
+    assert all(torch.equal(a, b) for a, b in zip(*sets, strict=True))
+    # The default is 0.2, and less where the support of the prior cuts the noise.
+    assert spread[None].max() < 0.2 * (1 + 2.2 / n**0.5)
+    assert spread[None].min() > 0.2 * (0.85 - 2.2 / n**0.5)
+    expected = torch.full_like(spread[0.001], 0.001)
+    torch.testing.assert_close(spread[0.001], expected, rtol=2.8 / n**0.5, atol=0)

@@ -8,25 +8,15 @@ from sbi.inference import NPE
 from sbi.neural_nets import posterior_nn
 
 from sbi_rope import CalibrationFinetuner, RoPE, SinkhornCoupler
-from sbi_rope.tasks import TASKS, Task, get_task
-from tests.tasks import ROOTS, skip_without_data
-
-OPTIONS = {"light_tunnel": {"image_size": 64}}
-
-
-@pytest.fixture(params=sorted(TASKS))
-def task(request: pytest.FixtureRequest) -> Task:
-    name = request.param
-    options = OPTIONS.get(name, {})
-    if "synthetic" in TASKS[name].variants:
-        return get_task(name, variant="synthetic", **options)
-    made = get_task(name, root=ROOTS.get(name), **options)
-    skip_without_data(made)
-    return made
+from sbi_rope.tasks import TASKS
+from tests.tasks import make, skip_without_data
 
 
 @pytest.mark.medium
-def test_rope_runs_on_the_task(task: Task) -> None:
+@pytest.mark.parametrize("name", sorted(TASKS))
+def test_rope_runs_on_the_task(name: str) -> None:
+    task = make(name)
+    skip_without_data(task)
     theta, x = task.get_simulations(300)
     npe = NPE(
         task.get_prior(),

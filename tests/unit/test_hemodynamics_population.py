@@ -1,63 +1,56 @@
-"""Who is drawn: hearts and arteries of people."""
+"""Who is drawn: hearts and arteries of people, and the density of the former."""
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from scipy.stats import kstest, truncnorm
 
 from sbi_rope.tasks.hemodynamics import population
 from sbi_rope.tasks.hemodynamics import population_tables as tables
 from sbi_rope.tasks.hemodynamics.population import (
-    NUISANCES,
     TRUNCATED_SD,
     Population,
     Process,
     ejection_time_slopes,
 )
+from sbi_rope.tasks.hemodynamics.prior import PopulationPrior
 from sbi_rope.tasks.hemodynamics.subject import Subject
 from tests.conftest import TEST_DATA
 
 N = 3000
 
 
-def _draw(
-    process: Process, n: int = N, **settings: float | str | bool
-) -> list[Subject]:
-    law = Population(**settings)  # type: ignore[arg-type]
-    return [law.draw(process, seed=3, index=i) for i in range(n)]
+def people_of(process: Process, n: int) -> list[Subject]:
+    return [Population().draw(process, seed=3, index=i) for i in range(n)]
 
 
-@pytest.fixture(scope="module")
-def people() -> dict[str, np.ndarray]:
-    subjects = _draw("simulator")
-    names = (*NUISANCES, "stroke_volume", "ejection_time", "period")
-    return {name: np.array([getattr(s, name) for s in subjects]) for name in names}
-
-
-def test_a_person_only_depends_on_settings_process_seed_and_index() -> None:
-    law = Population()
-    person = law.draw("real", seed=1, index=7)
-    assert law.draw("real", seed=1, index=7) == person
-    others = [
-        law.draw("simulator", seed=1, index=7),
-        law.draw("real", seed=2, index=7),
-        law.draw("real", seed=7, index=1),
-        law.draw("real", seed=1, index=8),
+def test_a_person_only_depends_on_process_seed_and_index() -> None:
+    who: list[tuple[Process, int, int]] = [
+        *[("real", 1, 7), ("simulator", 1, 7), ("real", 2, 7), ("real", 7, 1)],
+        ("real", 1, 8),
     ]
-    assert len({person.age, *(other.age for other in others)}) == 5
+    ages = [Population().draw(*one).age for one in (*who, *who)]
+    assert ages[:5] == ages[5:]
+    assert len(set(ages)) == 5
 
 
 @pytest.mark.medium
-def test_age_and_heart_follow_their_laws(people: dict[str, np.ndarray]) -> None:
-    age = people["age"]
+def test_age_and_heart_follow_their_laws() -> None:
+    age, rate, volume, time = np.array(
+        [
+            (s.age, s.heart_rate, s.stroke_volume, s.ejection_time)
+            for s in people_of("simulator", N)
+        ]
+    ).T
     assert kstest((age - 25) / 50, "uniform").pvalue > 1e-3
+    start, slope, noise_sd = ejection_time_slopes()
+    noise = (time - start - slope * tables.weissler_time(volume, rate)) / noise_sd
     mean, sd = tables.stroke_volume_law(age)
-    volume = (people["stroke_volume"] - mean) / sd
-    rate = (people["heart_rate"] - tables.heart_rate_mean(age)) / 11.0
-    time, slope, noise_sd = ejection_time_slopes()
-    weissler = tables.weissler_time(people["stroke_volume"], people["heart_rate"])
-    noise = (people["ejection_time"] - time - slope * weissler) / noise_sd
+    volume = (volume - mean) / sd
+    rate = (rate - tables.heart_rate_mean(age)) / 11.0
     law = truncnorm(-2.0, 2.0)
     for values in (volume, rate, noise):
         assert kstest(values, law.cdf).pvalue > 1e-3
@@ -82,7 +75,7 @@ def test_pulse_wave_velocity_has_the_published_quantiles() -> None:
 
 @pytest.mark.medium
 def test_real_lengths_vary_with_height_and_by_segment() -> None:
-    subjects = _draw("real", 1500)
+    subjects = people_of("real", 1500)
     logs = np.log([s.length_factors for s in subjects])
     others = logs[:, 2:]
     height = others.mean(axis=1)
@@ -123,3 +116,52 @@ def test_tables_are_the_published_ones() -> None:
     fitted = 1000 * design @ np.linalg.lstsq(design, data["lvet_s"], rcond=None)[0]
     ours = tables.weissler_time(data["sv"], data["hr"])
     assert np.corrcoef(fitted, ours)[0, 1] > 0.97
+
+
+# The density of stroke volume and ejection time --------------------------------------
+
+
+@pytest.mark.parametrize(
+    "source", ["prior", pytest.param("people", marks=pytest.mark.slow)]
+)
+def test_draws_and_people_follow_the_density_and_its_moments(source: str) -> None:
+    prior = PopulationPrior()
+    theta = prior.sample((8000,))
+    if source == "people":
+        people = people_of("simulator", 8000)
+        theta = torch.tensor([(s.stroke_volume, s.ejection_time) for s in people])
+    assert prior.support.check(theta).all()
+    assert prior.log_prob(theta).isfinite().all()
+    for probabilities in prior.marginal_cdf(theta).T:
+        assert kstest(probabilities, "uniform").pvalue > 1e-3
+    # Cells of a histogram, against sums of the density over midpoints of a grid.
+    edges = [np.linspace(25, 105, 13), np.linspace(200, 365, 13)]
+    counts = np.histogram2d(*theta.numpy().T, bins=edges)[0].ravel()
+    places = (torch.arange(800, dtype=torch.float64) + 0.5) / 800
+    points = torch.cartesian_prod(25 + 80 * places, 150 + 250 * places)
+    mass = prior.log_prob(points).exp() * 80 * 250 / 800**2
+    expected = np.histogram2d(*points.numpy().T, bins=edges, weights=mass)[0].ravel()
+    expected *= len(theta)
+    large = expected > 8
+    chi_squared = ((counts - expected)[large] ** 2 / expected[large]).sum()
+    assert chi_squared < large.sum() + 4 * (2 * large.sum()) ** 0.5
+    assert large.sum() > 30
+    torch.testing.assert_close(prior.mean, theta.mean(dim=0), rtol=0.01, atol=0.0)
+    torch.testing.assert_close(prior.stddev, theta.std(dim=0), rtol=0.03, atol=0.0)
+
+
+def test_density_is_the_integral_over_age_and_heart_rate() -> None:
+    def law(value: np.ndarray | float, mean: np.ndarray, sd: Any) -> np.ndarray:
+        return truncnorm.pdf((value - mean) / sd, -2.0, 2.0) / sd
+
+    start, slope, noise_sd = ejection_time_slopes()
+    age = 25 + 50 * (np.arange(2000) + 0.5) / 2000
+    rate = (50 + 52 * (np.arange(2000) + 0.5) / 2000)[:, None]
+    mean, sd = tables.stroke_volume_law(age)
+    law_of_rate = law(rate, tables.heart_rate_mean(age), tables.HEART_RATE_SD)
+    for volume, time in ((60.0, 280.0), (75.0, 310.0), (40.0, 262.0)):
+        predicted = start + slope * tables.weissler_time(volume, rate)
+        joint = law(volume, mean, sd) * law_of_rate * law(time, predicted, noise_sd)
+        expected = joint.mean() * 52  # ages have the density 1 / 50
+        found = PopulationPrior().log_prob(torch.tensor([volume, time])).exp()
+        assert float(found) == pytest.approx(expected, rel=5e-3)

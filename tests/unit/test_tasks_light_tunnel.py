@@ -1,11 +1,12 @@
 """The light tunnel's images: two models, recorded images, and a posterior from them."""
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from scipy.stats import betabinom
 from torch import Tensor
 
 from sbi_rope.tasks.light_tunnel import (
@@ -22,10 +23,9 @@ from sbi_rope.tasks.light_tunnel_models import (
     hexagon_mask,
     malus,
 )
-from tests.tasks import all_recorded
+from tests.tasks import all_recorded, write_csv
 
 SIZE = 64
-WriteData = Callable[..., Path]
 
 
 def draw_inputs(n: int) -> Tensor:
@@ -35,73 +35,33 @@ def draw_inputs(n: int) -> Tensor:
     return torch.cat([colours, angles], dim=1)
 
 
-def pixels_of(row: int, size: int = SIZE) -> Tensor:
-    """Return the recorded image of a row of the fixture, (3, size, size)."""
+def pixels_of(row: int) -> Tensor:
+    """Return the recorded image of a row, (3, size, size)."""
     generator = torch.Generator().manual_seed(row)
-    return torch.randint(256, (3, size, size), generator=generator, dtype=torch.uint8)
+    return torch.randint(256, (3, SIZE, SIZE), generator=generator, dtype=torch.uint8)
 
 
-@pytest.fixture
-def write_data(tmp_path: Path) -> WriteData:
-    """Write a small experiment in the official layout, and return the root."""
+def write_experiment(root: Path, experiment: str, rows: range) -> None:
+    """Write a small experiment in the official layout."""
     image_module = pytest.importorskip("PIL.Image")
-
-    def write(
-        num_rows: int = 12,
-        *,
-        experiment: str = UNIFORM,
-        size: int = SIZE,
-        offset: int = 0,
-    ) -> Path:
-        folder = tmp_path / DATASET / experiment
-        images = folder / f"images_{size}"
-        images.mkdir(parents=True)
-        columns = ["timestamp", *INPUTS, "image_file"]
-        lines = [",".join(columns)]
-        for i in range(offset, offset + num_rows):
-            row = {
-                "timestamp": i,
-                "red": i,
-                "green": 2 * i,
-                "blue": 254,
-                "pol_1": -10.0,
-                "pol_2": 2.5 * i,
-                "image_file": f"img_{i}.png",
-            }
-            lines.append(",".join(str(row[column]) for column in columns))
-            content = pixels_of(i, size).permute(1, 2, 0).contiguous().numpy()
-            image = image_module.frombytes("RGB", (size, size), content.tobytes())
-            image.save(images / f"img_{i}.png")
-        (folder / f"{experiment}.csv").write_text("\n".join(lines) + "\n")
-        return tmp_path
-
-    return write
-
-
-# The models --------------------------------------------------------------------------
-
-
-def package() -> object:
-    """Return causalchamber's models, or skip."""
-    return pytest.importorskip("causalchamber.models.image_capture")
+    folder = root / DATASET / experiment
+    table = [
+        dict(zip(INPUTS, (i, 2 * i, 254, -10.0, 2.5 * i), strict=True))
+        | {"image_file": f"img_{i}.png"}
+        for i in rows
+    ]
+    write_csv(folder / f"{experiment}.csv", table)
+    (folder / f"images_{SIZE}").mkdir()
+    for i in rows:
+        content = pixels_of(i).permute(1, 2, 0).contiguous().numpy().tobytes()
+        image = image_module.frombytes("RGB", (SIZE, SIZE), content)
+        image.save(folder / f"images_{SIZE}" / f"img_{i}.png")
 
 
 @pytest.mark.filterwarnings("ignore:Arrays of 2-dimensional:DeprecationWarning")
-def test_the_mask_is_that_of_causalchamber() -> None:
-    for size in (10, 63, 64, 100, 500):
-        expected = package().hexagon_mask(0.5, 0.5, 0.22, 0, size)  # type: ignore[attr-defined]
-        assert torch.equal(hexagon_mask(size).bool(), torch.as_tensor(expected))
-
-
-def test_the_mask_has_the_known_number_of_pixels() -> None:
-    found = {size: int(hexagon_mask(size).sum()) for size in (64, 100, 500)}
-    assert found == {64: 525, 100: 1277, 500: 31489}
-
-
-@pytest.mark.filterwarnings("ignore:Arrays of 2-dimensional:DeprecationWarning")
-@pytest.mark.parametrize("size", [64, 100])
+@pytest.mark.parametrize("size", [10, 63, 64, 100])
 def test_simulator_is_model_f1_of_causalchamber(size: int) -> None:
-    np = pytest.importorskip("numpy")
+    models = pytest.importorskip("causalchamber.models.image_capture")
     inputs = draw_inputs(30)
     inputs[0, 3:], inputs[1, 3:] = 0.0, torch.tensor([45.0, -45.0])
     first, second = np.deg2rad(inputs[:, 3].numpy()), np.deg2rad(inputs[:, 4].numpy())
@@ -110,34 +70,20 @@ def test_simulator_is_model_f1_of_causalchamber(size: int) -> None:
     theta = torch.cat([inputs[:, :3], alpha], dim=1)
     images = HexagonSimulator(image_size=size)(theta)
     for row, image in zip(inputs.tolist(), images, strict=True):
-        expected = package().model_f1(*row, 0.5, 0.5, 0.22, 0, size)  # type: ignore[attr-defined]
-        assert torch.equal(
-            image * 255, torch.as_tensor(expected).permute(2, 0, 1) * 1.0
-        )
+        expected = torch.as_tensor(models.model_f1(*row, 0.5, 0.5, 0.22, 0, size))
+        assert torch.equal(image * 255, expected.permute(2, 0, 1) * 1.0)
 
 
 @pytest.mark.filterwarnings("ignore:Arrays of 2-dimensional:DeprecationWarning")
 def test_stand_in_without_noise_is_model_f3_of_causalchamber() -> None:
-    np = pytest.importorskip("numpy")
-    response = np.array(
-        [
-            [0.29958, 0.06920, 0.02816],
-            [0.04017, 0.92099, 0.31265],
-            [0.00217, 0.20716, 0.75763],
-        ]
-    )
+    models = pytest.importorskip("causalchamber.models.image_capture")
+    red, green = (0.29958, 0.06920, 0.02816), (0.04017, 0.92099, 0.31265)
     constants = {
-        "S": response,
-        "w_r": 2.65625,
-        "w_g": 1.0,
-        "w_b": 1.77344,
-        "exposure": 2.5,
+        "S": np.array([red, green, (0.00217, 0.20716, 0.75763)]),
+        **{"w_r": 2.65625, "w_g": 1.0, "w_b": 1.77344, "exposure": 2.5},
         "Tp": np.array([[0.29, 0.35, 0.33]]).T,
         "Tc": np.array([[0.02, 0.08, 0.18]]).T,
-        "center_x": 0.5,
-        "center_y": 0.5,
-        "radius": 0.22,
-        "offset": 0,
+        **{"center_x": 0.5, "center_y": 0.5, "radius": 0.22, "offset": 0},
         "image_size": SIZE,
     }
     inputs = draw_inputs(30)
@@ -145,7 +91,7 @@ def test_stand_in_without_noise_is_model_f3_of_causalchamber() -> None:
     images = CameraSimulator(image_size=SIZE).image(theta)
     assert (images == 1).any()
     for row, image in zip(inputs.tolist(), images, strict=True):
-        expected = package().model_f3(*row, **constants)  # type: ignore[attr-defined]
+        expected = models.model_f3(*row, **constants)
         torch.testing.assert_close(image, torch.as_tensor(expected).permute(2, 0, 1))
 
 
@@ -154,12 +100,10 @@ def test_dequantised_simulations_are_uniform_within_their_levels() -> None:
     plain = 255 * HexagonSimulator(image_size=SIZE)(theta)
     spread = 256 * HexagonSimulator(image_size=SIZE, dequantise=True)(theta)
     share = (spread - plain.round()).flatten()
-    assert share.min() >= 0.0
-    assert share.max() <= 1.0
+    assert 0.0 <= share.min() < share.max() <= 1.0
     levels = torch.linspace(0.05, 0.95, 10)
-    torch.testing.assert_close(
-        share[:200_000].quantile(levels), levels, atol=0.01, rtol=0.0
-    )
+    found = share[:200_000].quantile(levels)
+    torch.testing.assert_close(found, levels, atol=0.01, rtol=0.0)
     assert spread[0].ne(spread[1]).all()
 
 
@@ -177,45 +121,30 @@ def test_camera_adds_noise_before_it_rounds_to_8_bit() -> None:
     assert (levels[:, :, ~inside] == 0).float().mean() == pytest.approx(0.54, abs=0.01)
 
 
-# The prior and the protocols ---------------------------------------------------------
-
-
 def test_crowded_parameters_are_beta_binomial() -> None:
-    stats = pytest.importorskip("scipy.stats")
     theta = draw_crowded(20_000)
-    colours = stats.betabinom(255, 5, 5)
-    assert torch.equal(theta[:, :3], theta[:, :3].round())
-    for colour in theta[:, :3].T:
-        grid = torch.arange(0, 256, 16)
-        shares = (colour.unsqueeze(1) <= grid).float().mean(dim=0)
-        expected = torch.as_tensor(colours.cdf(grid)).float()
-        torch.testing.assert_close(shares, expected, atol=0.015, rtol=0.0)
-    angles = stats.betabinom(360, 5, 5).rvs((2, 20_000), random_state=0) - 180.0
-    alpha = malus(torch.as_tensor(angles).T).flatten()
-    levels = torch.linspace(0.05, 0.95, 10)
-    torch.testing.assert_close(
-        theta[:, 3].quantile(levels),
-        alpha.quantile(levels.double()).float(),
-        atol=0.02,
-        rtol=0.0,
-    )
-    assert theta.dtype == torch.float32
+    levels = betabinom(255, 5, 5).cdf(np.arange(0, 256, 16))
+    for colour in theta[:, :3].T.numpy():
+        shares = (colour[:, None] <= np.arange(0, 256, 16)).mean(axis=0)
+        np.testing.assert_allclose(shares, levels, atol=0.015)
+    angles = betabinom(360, 5, 5).rvs((20_000, 2), random_state=0) - 180.0
+    alpha = malus(torch.as_tensor(angles)).flatten()
+    steps = np.linspace(0.05, 0.95, 10)
+    found, expected = np.quantile(theta[:, 3], steps), np.quantile(alpha, steps)
+    np.testing.assert_allclose(found, expected, atol=0.02)
 
 
-# Recorded images ---------------------------------------------------------------------
-
-
-def test_rows_of_a_file_become_parameters_and_images(write_data: WriteData) -> None:
-    task = LightTunnel(root=write_data(), image_size=SIZE)
+def test_rows_of_a_file_become_parameters_and_images(tmp_path: Path) -> None:
+    write_experiment(tmp_path, UNIFORM, range(12))
+    task = LightTunnel(root=tmp_path, image_size=SIZE)
     theta, x = all_recorded(task, 12)
-    assert sorted(theta[:, 0].tolist()) == list(range(12))
     i = theta[:, 0]
+    assert sorted(i.tolist()) == list(range(12))
     alpha = torch.deg2rad(10 + 2.5 * i).cos() ** 2
     expected = torch.stack([i, 2 * i, torch.full((12,), 254.0), alpha], dim=1)
     torch.testing.assert_close(theta, expected)
-    assert x.dtype == torch.float32
-    for row, image in zip(i.tolist(), x, strict=True):
-        assert torch.equal(image, pixels_of(int(row)) / 255)
+    images = torch.stack([pixels_of(int(row)) / 255 for row in i])
+    assert torch.equal(x, images)
 
 
 @pytest.mark.parametrize(
@@ -227,21 +156,18 @@ def test_rows_of_a_file_become_parameters_and_images(write_data: WriteData) -> N
     ],
 )
 def test_each_variant_takes_its_sets_from_its_experiments(
-    write_data: WriteData, variant: str | None, calibration: str, test: str
+    tmp_path: Path, variant: str | None, calibration: str, test: str
 ) -> None:
-    write_data()
     # The second experiment has other rows, and parameters far from the middle.
-    root = write_data(24, experiment=BETA_BINOMIAL, offset=50)
-    task = LightTunnel(root=root, image_size=SIZE, variant=variant)
-    assert task.required_files == tuple(
-        Path(DATASET, name, f"{name}.csv")
-        for name in dict.fromkeys((calibration, test))
-    )
+    write_experiment(tmp_path, UNIFORM, range(12))
+    write_experiment(tmp_path, BETA_BINOMIAL, range(50, 74))
+    task = LightTunnel(root=tmp_path, image_size=SIZE, variant=variant)
+    assert {path.stem for path in task.required_files} == {calibration, test}
     assert task.has_data
-    for experiment, draw, num_rows in (
-        (calibration, task.get_calibration_set, {UNIFORM: 4, BETA_BINOMIAL: 8}),
-        (test, task.get_test_set, {UNIFORM: 8, BETA_BINOMIAL: 16}),
+    for experiment, draw, share in (
+        (calibration, task.get_calibration_set, 1),
+        (test, task.get_test_set, 2),
     ):
         # All rows of the part are there: nothing is rejected.
-        theta, _ = draw(num_rows[experiment])
+        theta, _ = draw(share * (8 if experiment == BETA_BINOMIAL else 4))
         assert ((theta[:, 0] >= 50) == (experiment == BETA_BINOMIAL)).all()

@@ -1,16 +1,13 @@
 """The light tunnel's sensors: law, prior and recorded data."""
 
-from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
-from sbi.utils import within_support
 from torch import Tensor
 
-from sbi_rope.tasks.distributions import UniformDistance
 from sbi_rope.tasks.light_tunnel_sensors import (
-    DATASET,
     INPUTS,
     OUTPUTS,
     LightTunnelSensors,
@@ -18,43 +15,9 @@ from sbi_rope.tasks.light_tunnel_sensors import (
 )
 from tests.tasks import all_recorded
 
-WriteTable = Callable[..., Path]
-
-
-@pytest.fixture
-def write_table(tmp_path: Path) -> WriteTable:
-    """Write a small file in the official layout, and return its root."""
-
-    def write(
-        num_rows: int = 9,
-        **changes: object,
-    ) -> Path:
-        columns = ["timestamp", *INPUTS, *OUTPUTS]
-        lines = [",".join(columns)]
-        for i in range(num_rows):
-            row = dict.fromkeys(columns, 100 + i) | {
-                "red": i % 41,
-                "green": 2 * (i % 41),
-                "blue": 85,
-                "pol_1": -10.0,
-                "pol_2": 2.5 * (i % 9),
-            }
-            row |= changes if i == 1 else {}
-            lines.append(",".join(str(row[column]) for column in columns))
-        folder = tmp_path / DATASET
-        folder.mkdir(exist_ok=True)
-        (folder / "uniform_reference.csv").write_text("\n".join(lines) + "\n")
-        return tmp_path
-
-    return write
-
-
-# The law -----------------------------------------------------------------------------
-
 
 def test_law_is_that_of_causalchamber() -> None:
     pandas = pytest.importorskip("pandas")
-    np = pytest.importorskip("numpy")
     sensors = pytest.importorskip("causalchamber.simulators.lt")
     law = sensors.Deterministic(
         S=np.array(
@@ -101,65 +64,29 @@ def test_noise_is_relative_on_light_and_additive_on_the_current() -> None:
     assert current.std() == pytest.approx(4.0, rel=0.03)
 
 
-# Recorded data -----------------------------------------------------------------------
-
-
-def test_the_law_overpredicts_the_light_by_the_known_ratios(
+def test_the_recorded_readings_are_the_published_ones_and_smaller_than_the_law(
     chamber_extract: Path,
 ) -> None:
     theta, x = all_recorded(LightTunnelSensors(root=chamber_extract), 450)
-    assert len(theta) == 450
+    # The first row of the file: its colours, angles and readings as published.
+    first = [72.0, 18.0, 60.0, 5.962499618530273 + 2.0250000953674316]
+    (row,) = (theta == torch.tensor(first)).all(dim=1).nonzero().flatten().tolist()
+    readings = torch.tensor([14377.0, 3598.0, 1767.0, 465.0, 567.0, 159.0])
+    torch.testing.assert_close(x[row, :6], readings.log1p())
+    assert x[row, 6] == 72.0
     measured = x[:, :6].expm1().mean(dim=0)
     ratios = LightTunnelSimulator().readings(theta)[:, :6].mean(dim=0) / measured
     expected = torch.tensor([1.23, 1.24, 1.24, 1.26, 1.26, 1.34])
     torch.testing.assert_close(ratios, expected, atol=0.02, rtol=0.0)
 
 
-def test_all_6000_recorded_parameters_follow_the_prior(chamber_root: Path) -> None:
-    theta, _ = all_recorded(LightTunnelSensors(root=chamber_root), 6000)
-    # Distribution functions of the prior, which are uniform where it is right.
-    colour = (theta[:, :3] + 0.5) / 86
-    angle = UniformDistance(torch.tensor([40.0])).cdf(theta[:, 3:])
-    levels = torch.cat([colour, angle], dim=1).sort(dim=0).values
-    distance = (levels - torch.linspace(0, 1, 6000).unsqueeze(1)).abs().amax(dim=0)
-    # Colours are integers (half a step is 0.006); angles come out a little small.
-    assert (distance < torch.tensor([0.02, 0.02, 0.02, 0.05])).all()
-
-
-def test_a_recorded_row_becomes_the_parameters_and_the_observation(
+def test_strong_variants_have_one_colour_above_170_or_angles_of_42_to_118_degrees(
     chamber_extract: Path,
 ) -> None:
-    # The first row of the file: its colours, angles and readings as published.
-    theta, x = all_recorded(LightTunnelSensors(root=chamber_extract), 450)
-    first = [72.0, 18.0, 60.0, 5.962499618530273 + 2.0250000953674316]
-    (row,) = (theta == torch.tensor(first)).all(dim=1).nonzero().flatten().tolist()
-    readings = torch.tensor([14377.0, 3598.0, 1767.0, 465.0, 567.0, 159.0])
-    torch.testing.assert_close(x[row, :6], readings.log1p())
-    assert x[row, 6] == 72.0
-
-
-def test_the_readings_come_in_the_order_of_the_simulator(
-    write_table: WriteTable,
-) -> None:
-    changes = {name: 10**i for i, name in enumerate(OUTPUTS)}
-    theta, x = all_recorded(LightTunnelSensors(root=write_table(**changes)), 9)
-    row = x[theta[:, 0] == 1][0]
-    torch.testing.assert_close(row[:6].expm1(), 10.0 ** torch.arange(6))
-    assert row[6] == 1e6
-
-
-# Variants ----------------------------------------------------------------------------
-
-
-def test_strong_colours_have_one_colour_above_170(chamber_extract: Path) -> None:
     task = LightTunnelSensors(root=chamber_extract, variant="strong_colours")
     for theta, _ in (task.get_calibration_set(30), task.get_test_set(60)):
         assert ((theta[:, :3] >= 171).sum(dim=1) == 1).all()
         assert (theta[:, :3] >= 171).any(dim=0).all()
-    assert not within_support(LightTunnelSensors().get_prior(), theta).any()
-
-
-def test_strong_angles_are_42_to_118_degrees(chamber_extract: Path) -> None:
     task = LightTunnelSensors(root=chamber_extract, variant="strong_angles")
     theta = torch.cat([task.get_calibration_set(20)[0], task.get_test_set(40)[0]])
     assert theta[:, 3].min() == pytest.approx(44, abs=5.0)
@@ -169,19 +96,16 @@ def test_strong_angles_are_42_to_118_degrees(chamber_extract: Path) -> None:
 def test_sensor_settings_change_the_test_set_only(chamber_extract: Path) -> None:
     task = LightTunnelSensors(root=chamber_extract, variant="sensor_settings")
     standard = LightTunnelSensors(root=chamber_extract)
-    theta, x = standard.get_calibration_set(100)
-    assert torch.equal(task.get_calibration_set(100)[0], theta)
-    assert torch.equal(task.get_calibration_set(100)[1], x)
-    simulator = standard.get_simulator()
+    sets = (some.get_calibration_set(100) for some in (task, standard))
+    assert all(torch.equal(a, b) for a, b in zip(*sets, strict=True))
 
-    def log_ratios(theta: Tensor, x: Tensor) -> Tensor:
-        return x[:, :6] - simulator.readings(theta)[:, :6].log1p()
+    def darker(theta: Tensor, x: Tensor) -> Tensor:
+        law = LightTunnelSimulator().readings(theta)[:, :6].log1p()
+        return (x[:, :6] - law < -1.5).double().mean(dim=0)
 
     # An exposure time of 0 instead of 3 is an eighth of the light, at another of the
     # six diodes in six of the seven experiments.
-    darker = log_ratios(*task.get_test_set(140)) < -1.5
-    assert not (log_ratios(theta, x) < -1.5).double().mean() > 0.05
-    share = darker.double().mean(dim=0)
-    torch.testing.assert_close(
-        share, torch.full_like(share, 1 / 7), atol=0.09, rtol=0.0
-    )
+    assert darker(*task.get_calibration_set(100)).mean() <= 0.05
+    share = darker(*task.get_test_set(140))
+    expected = torch.full_like(share, 1 / 7)
+    torch.testing.assert_close(share, expected, atol=0.09, rtol=0.0)

@@ -10,11 +10,8 @@ from sbi_rope.tasks.pendulum import Pendulum, PendulumSimulator
 
 def test_positions_are_a_damped_cosine() -> None:
     theta = torch.tensor([[0.0, 2.0], [math.pi, 3.0]], dtype=torch.float64)
-    x = PendulumSimulator().position(
-        theta,
-        phase=torch.tensor([[0.0], [0.0]]),
-        damping=torch.tensor([[0.0], [0.5]]),
-    )
+    damping = torch.tensor([[0.0], [0.5]])
+    x = PendulumSimulator().position(theta, phase=0 * damping, damping=damping)
     torch.testing.assert_close(x[0], torch.full((200,), 2.0, dtype=torch.float64))
     assert x[1, 0] == pytest.approx(3.0)
     # pi rad/s for 10 s are five full turns.
@@ -53,9 +50,5 @@ def test_the_weight_is_the_share_of_the_tighter_distribution() -> None:
             inside = ((theta >= low) & (theta <= high)).all(dim=1).double().mean()
             expected = weight + (1 - weight) * 3 / 28.5
             assert inside == pytest.approx(expected, abs=0.04)
-    # The prior that is assumed is the same.
-    draws = task.get_prior().sample((20_000,))
-    assert draws.min(dim=0).values.tolist() == pytest.approx([0.0, 0.5], abs=0.01)
-    assert draws.max(dim=0).values.tolist() == pytest.approx([3.0, 10.0], abs=0.01)
     assert Pendulum(variant="misspecified_prior").misspecification_weight == 0.5
     assert Pendulum().misspecification_weight == 0.0
