@@ -84,7 +84,7 @@ class Density(ConditionalDensityEstimator):
     @property
     def device(self) -> torch.device:
         """Where its tensors are."""
-        return next(self.buffers()).device
+        return next(self.buffers(), torch.empty(0)).device
 
     def readable(self, x: Tensor) -> Tensor:
         """Tell which observations can be embedded, ``(n, *event)`` to ``(n,)``."""

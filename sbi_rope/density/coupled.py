@@ -130,9 +130,8 @@ class Coupled(OverSimulations):
     def __getitem__(self, index: int) -> "Coupled":
         """Return the same mixture for one of the observations alone."""
         number = range(len(self.x_o))[index]
-        rows = slice(number, number + 1)
-        coupling = replace(self.coupling, real=self.coupling.real[rows])
-        return Coupled(self.density, self.simulated, self.x_o[rows], coupling)
+        coupling = replace(self.coupling, real=self.coupling.real[number][None])
+        return Coupled(self.density, self.simulated, self.x_o[number][None], coupling)
 
     def embed(self, x: Tensor) -> Tensor:
         """Return the embeddings of observations of the batch, ``(n, l)``."""

@@ -138,8 +138,6 @@ class Flow(Density):
         headless(copied).load_state_dict(density.state_dict())  # shares its tensors
         return with_embedding(copied, self.nets.member(0)).eval()
 
-    # --- training ---
-
     def losses(self, theta: Tensor, x: Tensor) -> Tensor:
         """Return the losses ``(E, B)`` at theta ``(E, B, d)``, x ``(E, B, *event)``."""
         return self.losses_given(theta, self.embeddings(x))
@@ -152,8 +150,6 @@ class Flow(Density):
         """Return the losses at embedded observations, shape ``(E, B, l)``."""
         losses = self.densities.answer(loss_of, theta.flatten(0, 1), z.flatten(0, 1))
         return losses.reshape(theta.shape[:2])
-
-    # --- density ---
 
     @torch.no_grad()
     def embed(self, x: Tensor) -> Tensor:

@@ -27,8 +27,6 @@ from sbi_rope.utils.tensors import as_batch, as_numbers, rows_with
 # which are minutes. In a stack the prior often keeps a share just below MIN_ACCEPTANCE.
 MIN_OF_ROW, MIN_PROPOSALS, MAX_PROPOSALS = 5_000, 100_000, 10_000_000
 MIN_ACCEPTANCE = 1e-3
-# Where all were rejected, the share inside is taken for that of so many.
-PSEUDO_COUNT = 0.1
 # A flow takes about as long for this many draws as for a single one.
 SMALL_BATCH = 512
 
@@ -181,6 +179,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         x = self._one_x(x)
         return self.sample_batched(sample_shape, x, *args, **options).squeeze(-2)
 
+    @torch.no_grad()
     def sample_batched(  # type: ignore[override]
         self,
         sample_shape: Any,
@@ -221,10 +220,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         # Observation by observation, so that few of them are needed at a time.
         slots = torch.arange(total, device=theta.device).split(size)
         show = is_shown(show_progress_bars)
-        with (
-            torch.no_grad(),
-            progress_bar(show=show, desc="Sampling", total=total) as bar,
-        ):
+        with progress_bar(show=show, desc="Sampling", total=total) as bar:
             for slot in slots if total else ():
                 row, number = slot // num_samples, slot % num_samples
                 theta[number * num_rows + row] = draw(row)
@@ -337,8 +333,8 @@ def accepted(
 ) -> Tensor:
     """Draw for each of n numbers of rows until one is accepted, ``(n, d)``.
 
-    At most ``size`` draws are made at a time. The ``counts``, ``(2, B)``, of all and of
-    accepted proposals for each row go on from call to call.
+    At most ``size`` draws are made at a time. The ``counts`` of proposed and accepted
+    draws of each row, ``(2, B)``, go on from call to call.
     """
     (proposed, inside), num_rows = counts, counts.shape[1]
     theta, rate = torch.empty(0), 1.0
@@ -364,7 +360,8 @@ def accepted(
         missing = row[left].bincount(minlength=num_rows).cpu()
         is_slow = (missing > 0) & (proposed >= MIN_OF_ROW)
         is_slow &= inside < MIN_ACCEPTANCE * proposed
-        further = (missing * proposed / (inside + PSEUDO_COUNT))[is_slow].sum()
+        # Where all were rejected, a tenth of a draw counts as accepted.
+        further = (missing * proposed / (inside + 0.1))[is_slow].sum()
         if proposed[is_slow].sum() >= MIN_PROPOSALS and further > MAX_PROPOSALS:
             numbers = is_slow.nonzero().flatten()[:5].tolist()
             raise SamplingError(

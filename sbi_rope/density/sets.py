@@ -284,12 +284,9 @@ class MakesSets:
         check("level", level, Level)
         check("num_samples", num_samples, Count)
         density = self.posterior_estimator
-        shape: tuple[int, ...] = tuple(density.input_shape)
-        if x is None or np.ndim(x) == len(density.condition_shape):
-            x = self._one_x(x)
-        else:
-            x = self._batch_of_x(x)
-            shape = (len(x), *shape)
+        is_one = x is None or np.ndim(x) == len(density.condition_shape)
+        x = self._one_x(x) if is_one else self._batch_of_x(x)
+        shape = density.input_shape if is_one else (len(x), *density.input_shape)
         make = _guaranteed if guaranteed else _of_draws
         with seeded(seed), torch.no_grad():
             guarantee, low, high, rule = make(self, level, x, num_samples)
