@@ -61,9 +61,7 @@ def batch() -> Tensor:
         return problems.simulate(problems.box(1).sample((4,))) + 0.2
 
 
-def coupled(
-    family: str | None = None, tail_mass: float = 1e-3, **options: Any
-) -> Coupled:
+def coupled(family: str | None = None, tail_mass: float = 1e-3) -> Coupled:
     """Four observations and nine simulations."""
     with torch.random.fork_rng():
         torch.manual_seed(4)
@@ -76,8 +74,7 @@ def coupled(
             h = embedding_of(npe(family))
             simulated = h(problems.simulate(problems.box(1).sample((9,)))).detach()
         coupling = problems.coupling_of(weights, simulated)
-        net = nn.Linear(3, simulated.shape[1])
-    found = Coupled(density, simulated, batch(), net, coupling, **options)
+    found = Coupled(density, simulated, batch(), coupling)
     found.tail_mass = tail_mass
     return found
 
@@ -264,8 +261,7 @@ def test_a_mixture_is_the_weighted_sum_of_its_parts_and_their_draws() -> None:
     weights = torch.tensor([0.2, 0.5, 0.3])
     expected = torch.einsum("k,ksb->sb", weights, log_probs.exp()).log()
     assert torch.allclose(density.log_prob(theta, x), expected, atol=1e-4)
-    nested = Mixture([density, density.parts[0]], [0.5, 0.5])
-    assert nested.weights.tolist() == pytest.approx([0.1, 0.25, 0.15, 0.5])
+    assert len(mixture(0.5, 0.0, 0.5).parts) == 2
     # Spikes at integers tell where draws come from.
     spikes = torch.tensor([[0.0, -9.0], [1.0, -9.0]])
     parts = [
@@ -341,32 +337,19 @@ def test_an_observation_is_found_by_its_value() -> None:
         assert torch.equal(posterior.log_prob(theta, x=same), expected)
 
 
-def test_an_unseen_observation_is_refused_or_extends_the_coupling() -> None:
-    new, theta = torch.randn(2, 3), torch.zeros(1, 2)
-    refusing: Any = problems.gaussian_posterior()
+def test_an_observation_outside_the_batch_is_refused() -> None:
+    new, posterior = torch.randn(2, 3), problems.gaussian_posterior()
     for call in (
-        lambda: refusing.sample((2,), x=new[:1], **QUIET),
-        lambda: refusing.log_prob_batched(theta, new),
-        lambda: refusing.potential(theta, x=new[:1]),
+        lambda: posterior.sample((2,), x=new[:1], **QUIET),
+        lambda: posterior.log_prob_batched(torch.zeros(1, 2), new),
+        lambda: posterior.potential(torch.zeros(1, 2), x=new[:1]),
     ):
         with pytest.raises(InvalidInputError, match=r"rope.build_posterior\(x\)"):
             call()
-    posterior: Any = problems.gaussian_posterior(unseen="extend")
-    expected = posterior.coupling.rows(posterior.posterior_estimator.net(new).detach())
-    smallest = float((1 / expected.square().sum(dim=1)).min())
-    mixed = torch.cat([new[:1], posterior.x_o[2:3], new[1:]])
-    with pytest.warns(RoPEWarning, match=rf"2 unseen.*size is {smallest:.1f} of 12"):
-        rows = problems.rows_of(posterior, mixed)
-    assert torch.allclose(rows[[0, 2]], expected, atol=1e-12)
-    assert torch.equal(rows[1], posterior.weights[2])
-    with pytest.warns(RoPEWarning) as caught:
-        posterior.log_prob(theta, x=new[0])
-    assert [warning.filename for warning in caught] == [__file__]
 
 
-@pytest.mark.parametrize("unseen", ["raise", "extend"])
-def test_the_posterior_of_one_observation_answers_as_the_whole(unseen: Any) -> None:
-    posterior = posterior_of(coupled(unseen=unseen))
+def test_the_posterior_of_one_observation_answers_as_the_whole() -> None:
+    posterior = posterior_of(coupled())
     theta = 2 * torch.rand(6, 1) - 1
     for i in (0, 3):
         view, x = pickle.loads(pickle.dumps(posterior[i])), posterior.x_o[i]
@@ -375,11 +358,8 @@ def test_the_posterior_of_one_observation_answers_as_the_whole(unseen: Any) -> N
         samples = view.sample((20,), **QUIET)
         torch.manual_seed(i)
         assert torch.equal(samples, posterior.sample((20,), x=x, **QUIET))
-        for one in (view, view[0], view[-1]):
-            assert len(one) == 1
-            assert torch.equal(one.default_x[0], x)
-            assert torch.equal(one.x_o, posterior.x_o[i : i + 1])
-            assert torch.equal(one.weights, posterior.weights[i : i + 1])
+        assert torch.equal(view.x_o, posterior.x_o[i : i + 1])
+        assert torch.equal(view.weights, posterior.weights[i : i + 1])
         with pytest.raises(IndexError):
             view[1]
 
