@@ -1,6 +1,5 @@
 """Credible sets: closed forms, the arithmetic of the guarantee, and its coverage."""
 
-import math
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +11,6 @@ from torch import Tensor
 from sbi_rope import MixturePosterior, StackedPosterior
 from sbi_rope.density import Flow
 from sbi_rope.density.sets import (
-    Guarantee,
     MakesSets,
     SetScores,
     is_held,
@@ -103,13 +101,18 @@ def test_joint_scores_count_the_draws_of_higher_density() -> None:
 
 
 def test_marginal_ends_are_those_of_all_values_with_a_lower_score() -> None:
-    for draws in (torch.randn(2, 30), torch.randint(3, (2, 30)).float()):
-        values = (torch.arange(-400, 601) / 100).expand(2, -1)
-        scores = marginal_scores(values, draws)
-        for limit in (0.3, 0.8, 1.7):
-            low, high = marginal_ends(torch.full((2, 1), limit), draws)
-            inside = (values >= low - 1e-6) & (values <= high + 1e-6)
-            assert torch.equal(inside, scores <= limit + 1e-6)
+    draws = torch.randn(2, 30)
+    values = (torch.arange(-400, 601) / 100).expand(2, -1)
+    scores = marginal_scores(values, draws)
+    for limit in (0.3, 0.8, 1.7):
+        low, high = marginal_ends(torch.full((2, 1), limit), draws)
+        inside = (values >= low - 1e-6) & (values <= high + 1e-6)
+        assert torch.equal(inside, scores <= limit + 1e-6)
+    # An interval holds its own value also among equal draws, or if all are equal.
+    for draws in (torch.randint(3, (30,)), torch.ones(30)):
+        values = torch.arange(5.0)
+        low, high = marginal_ends(marginal_scores(values, draws), draws)
+        assert ((low - 1e-6 <= values) & (values <= high + 1e-6)).all()
 
 
 def test_marginal_scores_agree_with_ranks_and_go_on_beyond_the_draws() -> None:
@@ -117,9 +120,6 @@ def test_marginal_scores_agree_with_ranks_and_go_on_beyond_the_draws() -> None:
     theta = torch.tensor([49.0, 73.0, 0.0, 98.0, 98.0 + 98.0])
     expected = [0, 0.48, 0.98, 0.98, 2.98]
     assert marginal_scores(theta, draws).tolist() == pytest.approx(expected)
-    same = torch.ones(5)
-    ends = marginal_ends(marginal_scores(torch.tensor([1.0, 2.0]), same), same)
-    assert ends.tolist() == [[1.0, -math.inf], [1.0, math.inf]]
 
 
 def held_by_counting(
@@ -139,17 +139,6 @@ def test_sets_are_those_of_counting_the_pairs(level: float) -> None:
         expected = held_by_counting(scores, fold, at_theta, level)
         held = is_held(scores, fold, at_theta, rank=rank_needed(level, n))
         assert torch.equal(held, expected)
-
-
-def test_the_bound_is_that_of_the_theorem() -> None:
-    promised = Guarantee(level=0.9, num_pairs=50, num_folds=5)
-    assert promised.lower_bound == pytest.approx(1 - 0.2 - 2 * 0.8 / 11)
-    many = Guarantee(level=0.9, num_pairs=10_000, num_folds=5)
-    assert many.lower_bound == pytest.approx(1 - 0.2 - 1.6 / 2001)
-    alone = Guarantee(level=0.9, num_pairs=20, num_folds=20)
-    assert alone.lower_bound == pytest.approx(0.8)
-    assert Guarantee(level=0.5, num_pairs=10, num_folds=5).lower_bound == 0.0
-    assert "at least 0.655" in str(promised)
 
 
 class Wrong(MakesSets):
