@@ -109,19 +109,6 @@ def test_map_finds_the_mode() -> None:
         assert view.log_prob(mode) > best - 0.02
 
 
-# --- the batch, and ensembles ---
-
-
-def test_length_indexing_and_iteration_follow_the_batch() -> None:
-    posterior = gaussian_posterior()
-    assert len(posterior) == 5
-    assert torch.equal(posterior[-1].default_x, posterior.x_o[4:])
-    with pytest.raises(IndexError):
-        posterior[5]
-    seen = torch.cat([view.default_x for view in posterior])
-    assert torch.equal(seen, posterior.x_o)
-
-
 def test_an_ensemble_of_sbi_averages_posteriors() -> None:
     members = [gaussian_posterior(x_o=torch.ones(5, 3)) for _ in range(2)]
     weights, x = torch.tensor([0.7, 0.3]), torch.ones(1, 3)
