@@ -253,7 +253,7 @@ def gaussian_posterior(
     if prior is None:
         prior = box(dim)
     coupling = coupling_of(weights, embeddings)
-    density = Coupled(Gaussians(dim), embeddings, x_o, coupling)
+    density = Coupled(Gaussians(dim), x_o, coupling)
     density.tail_mass = tail_mass
     return MixturePosterior(density, prior)
 

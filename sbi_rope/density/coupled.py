@@ -107,21 +107,16 @@ class Coupled(OverSimulations):
 
     Args:
         density: :math:`q(\theta \mid s)`.
-        simulated: :math:`h(x_s)`, shape ``(n_s, l)``.
         x_o: The real observations that were coupled, shape ``(n_o, *event)``.
-        coupling: The coupling of :math:`g(x_o)` with the simulations.
+        coupling: The coupling of :math:`g(x_o)` with :math:`h(x_s)`.
     """
 
     x_o: Tensor
 
     def __init__(
-        self,
-        density: ConditionalDensityEstimator,
-        simulated: Tensor,
-        x_o: Tensor,
-        coupling: Coupling,
+        self, density: ConditionalDensityEstimator, x_o: Tensor, coupling: Coupling
     ) -> None:
-        super().__init__(density, simulated, x_o.shape[1:])
+        super().__init__(density, coupling.simulated.to(x_o), x_o.shape[1:])
         self.coupling = coupling
         self.register_buffer("x_o", x_o)
         # Backwards, so that of equal observations the first is found.
@@ -131,7 +126,7 @@ class Coupled(OverSimulations):
         """Return the same mixture for one of the observations alone."""
         number = range(len(self.x_o))[index]
         coupling = replace(self.coupling, real=self.coupling.real[number][None])
-        return Coupled(self.density, self.simulated, self.x_o[number][None], coupling)
+        return Coupled(self.density, self.x_o[number][None], coupling)
 
     def embed(self, x: Tensor) -> Tensor:
         """Return the embeddings of observations of the batch, ``(n, l)``."""

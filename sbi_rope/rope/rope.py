@@ -349,7 +349,7 @@ class RoPE:
         warn_of_far_entries("x_o", x_o, npe.h)
         coupling = coupler.couple(real, simulated)
         posterior = MixturePosterior(
-            Coupled(npe.density(), simulated, x_o, coupling),
+            Coupled(npe.density(), x_o, coupling),
             npe.prior,
             enable_transform=npe.enable_transform,
         )

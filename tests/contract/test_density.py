@@ -73,7 +73,7 @@ def coupled(family: str | None = None, tail_mass: float = 1e-3) -> Coupled:
             h = embedding_of(npe(family))
             simulated = h(problems.simulate(problems.box(1).sample((9,)))).detach()
         coupling = problems.coupling_of(weights, simulated)
-    found = Coupled(density, simulated, batch(), coupling)
+    found = Coupled(density, batch(), coupling)
     found.tail_mass = tail_mass
     return found
 
