@@ -40,7 +40,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
 
     with Z(x) the mass inside the support of the prior. It has all methods of sbi's
     :class:`DirectPosterior` and works with sbi's diagnostics. That of RoPE (see
-    :class:`Coupled`) belongs to a batch of observations, its ``x_o``. Others are
+    :class:`~sbi_rope.density.Coupled`) belongs to a batch, its ``x_o``. Others are
     amortised and answer any x.
 
     Args:
