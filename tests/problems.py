@@ -199,18 +199,12 @@ class Gaussians(ConditionalDensityEstimator):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TableCoupling(Coupling):
-    """A coupling with weights chosen by hand; the embedding of x_o is its number.
-
-    Observations that are not among ``real`` get the rows of an ordinary coupling.
-    """
+    """A coupling with weights chosen by hand; the embedding of x_o is its number."""
 
     table: Tensor = field(repr=False)
 
     def rows(self, real: Tensor) -> Tensor:
-        rows = super().rows(real)
-        known = (real[:, None] == self.real).all(dim=-1).any(dim=1)
-        rows[known] = self.table[real[known, 0].long()]
-        return rows
+        return self.table[real[:, 0].long()]
 
     def to(self, device: str | torch.device) -> "TableCoupling":
         return replace(super().to(device), table=self.table.to(device))
@@ -247,10 +241,9 @@ def gaussian_posterior(
     weights: Tensor | None = None,
     embeddings: Tensor | None = None,
     x_o: Tensor | None = None,
-    unseen: Any = "raise",
     tail_mass: float = 0.0,
 ) -> MixturePosterior:
-    """A mixture of analytic Gaussians with three readings in x_o and a linear g."""
+    """A mixture of analytic Gaussians with three readings in x_o."""
     if embeddings is None:
         embeddings = embeddings_of(dim, n_s, std=std)
     if x_o is None:
@@ -259,14 +252,8 @@ def gaussian_posterior(
         weights = (2 * torch.randn(len(x_o), len(embeddings))).double().softmax(dim=1)
     if prior is None:
         prior = box(dim)
-    density = Coupled(
-        Gaussians(dim),
-        embeddings,
-        x_o,
-        nn.Linear(x_o[0].numel(), 2 * dim),
-        coupling_of(weights, embeddings),
-        unseen=unseen,
-    )
+    coupling = coupling_of(weights, embeddings)
+    density = Coupled(Gaussians(dim), x_o, coupling)
     density.tail_mass = tail_mass
     return MixturePosterior(density, prior)
 

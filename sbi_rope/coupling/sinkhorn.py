@@ -194,6 +194,7 @@ def solve_pot(
     # reg is 1 because the cost is already divided by gamma, and so is rho.
     rho = math.inf if tau == 1.0 else tau / (1.0 - tau)
     best, iterations = Solution(b.new_zeros(n_s), math.inf, 0), 0
+    problem: Any = (a, b, scaled, 1.0, (math.inf, rho), "sinkhorn", "kl")
     while iterations < max_iterations:
         count = min(BURST, max_iterations - iterations)
         # POT computes u from v first, so that u may start at zero.
@@ -201,17 +202,7 @@ def solve_pot(
         options: Any = {"numItermax": count, "stopThr": 0.0, "warmstart": start}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            _, log = ot.unbalanced.sinkhorn_unbalanced(
-                a,
-                b,
-                scaled,
-                1.0,
-                (math.inf, rho),
-                "sinkhorn",
-                "kl",
-                log=True,
-                **options,
-            )
+            _, log = ot.unbalanced.sinkhorn_unbalanced(*problem, log=True, **options)
         iterations += count
         potential = log["logv"] - log["logv"].mean()
         if not potential.isfinite().all():  # its scalings over- or underflow

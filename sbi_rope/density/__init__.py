@@ -1,6 +1,6 @@
 """Densities of parameters given an observation, such as the posterior of RoPE."""
 
-from sbi_rope.density.base import Density, Given, Prior
+from sbi_rope.density.base import Density, Prior
 from sbi_rope.density.coupled import Coupled, OverSimulations
 from sbi_rope.density.flow import Flow
 from sbi_rope.density.mixture import Mixture, density_of
@@ -12,7 +12,6 @@ __all__ = [
     "Density",
     "Flow",
     "GaussianProcess",
-    "Given",
     "Mixture",
     "MixturePosterior",
     "OverSimulations",

@@ -1,6 +1,5 @@
 r"""Densities :math:`q(\theta \mid x)` for any observation x."""
 
-import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -11,11 +10,8 @@ from torch.distributions import Distribution
 
 from sbi_rope.npe.prior import PriorDistribution
 from sbi_rope.npe.sbi import ConditionalDensityEstimator
-from sbi_rope.utils.errors import InvalidInputError, warn_user
+from sbi_rope.utils.errors import warn_user
 from sbi_rope.utils.seeds import seeded
-
-# sbi converts every x to this dtype, and its estimators work in no other.
-DTYPE = torch.float32
 
 # Tells which parameters ``(n, d)`` are inside the prior's support, ``(n,)``.
 Accept = Callable[[Tensor], Tensor]
@@ -27,7 +23,6 @@ CPU_BATCH, GPU_BATCH = 2**14, 2**17
 MAX_ENTRIES = 2**19
 # Draws from which the mass inside the prior's support is estimated.
 NUM_DRAWS = 1024
-
 
 # glibc keeps freed memory only after it once freed a block of almost 32 MiB. Flows are
 # a third faster then.
@@ -89,36 +84,24 @@ class Density(ConditionalDensityEstimator):
     @property
     def device(self) -> torch.device:
         """Where its tensors are."""
-        return next(self.buffers()).device
+        return next(self.buffers(), torch.empty(0)).device
 
     def readable(self, x: Tensor) -> Tensor:
         """Tell which observations can be embedded, ``(n, *event)`` to ``(n,)``."""
         return torch.isfinite(x).flatten(1).all(dim=1)
 
     @torch.no_grad()
-    def mass(
-        self,
-        z: Any,
-        num_rows: int,
-        accept: Accept,
-        *,
-        share: float = 1.0,
-        seed: int = 0,
-    ) -> Tensor:
+    def mass(self, z: Any, num_rows: int, accept: Accept) -> Tensor:
         """Estimate the mass inside the prior's support of B embedded observations.
 
-        The random numbers are the same in every call. In a mixture, a part needs draws
-        for its ``share`` only, and a ``seed`` of its own, so that errors average out.
-        The result is float64.
+        The random numbers are the same in every call. The result is float64.
         """
-        count = math.ceil(NUM_DRAWS * share)
-        every = torch.arange(num_rows, device=self.device)
-        with seeded(seed):
+        rows = torch.arange(num_rows, device=self.device).split(num_fitting(NUM_DRAWS))
+        with seeded(0):
             inside = [
-                accept(self.draw(z, some.repeat_interleave(count)))
-                for some in batches(every, share=count)
+                accept(self.draw(z, some.repeat_interleave(NUM_DRAWS))) for some in rows
             ]
-        return torch.cat(inside).double().reshape(num_rows, count).mean(dim=1)
+        return torch.cat(inside).double().reshape(num_rows, NUM_DRAWS).mean(dim=1)
 
     def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
         r"""Return :math:`\log q(\theta \mid x)`, shape ``(S, B)``.
@@ -187,64 +170,8 @@ class Prior(Density):
         """Tell that any observation will do."""
         return torch.ones(len(x), dtype=torch.bool, device=x.device)
 
-    def mass(self, z: Tensor, num_rows: int, accept: Accept, **options: Any) -> Tensor:
-        """Estimate the mass inside the support of a prior once for all observations."""
-        return super().mass(z[:1], 1, accept, **options).expand(num_rows)
-
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:  # noqa: FBT001, FBT002
         # `to` calls this for each module, but a distribution is not a module.
         moved = super()._apply(fn, recurse)
         self.prior.to(self.device)
         return moved
-
-
-class Given(Density):
-    r"""A density that somebody else computes.
-
-    Args:
-        own: Has the methods ``log_prob(theta, x)``, shapes ``(S, B, d)`` and
-            ``(B, *event)`` to ``(S, B)``, and ``sample((n,), x)``, ``(n, B, d)``.
-        theta: Some parameters, shape ``(m, d)``, and
-        x: their observations, shape ``(m, *event)``, to try it on.
-    """
-
-    placeholder: Tensor
-
-    def __init__(self, own: Any, theta: Tensor, x: Tensor) -> None:
-        super().__init__(theta.shape[1:], x.shape[1:])
-        self.own = own
-        self.register_buffer("placeholder", theta.new_empty(0))
-        with torch.no_grad():
-            found = own.log_prob(theta[None], x), own.sample(torch.Size((3,)), x)
-        shapes = tuple(tuple(one.shape) for one in found)
-        expected = (1, len(x)), (3, *theta.shape)
-        if shapes != expected:
-            raise InvalidInputError(
-                f"Expected log_prob(theta, x) of shape {expected[0]} and "
-                f"sample((3,), x) of shape {expected[1]} for {len(x)} observations; "
-                f"got {shapes[0]} and {shapes[1]}."
-            )
-
-    def embed(self, x: Tensor) -> Tensor:
-        """Return the observations themselves."""
-        return x
-
-    def log_q(self, theta: Tensor, z: Tensor) -> Tensor:
-        """Return the log density at theta ``(S, B, d)``, shape ``(S, B)``, float64."""
-        return self.own.log_prob(theta, z).double()
-
-    def draw(self, z: Tensor, row: Tensor) -> Tensor:
-        """Draw once for each of n numbers of observations, ``(n, d)``."""
-        rows, column = row.unique(return_inverse=True)
-        place = places(column)
-        draws = self.own.sample(torch.Size((int(place.max()) + 1,)), z[rows])
-        return draws[place, column]
-
-
-def places(numbers: Tensor) -> Tensor:
-    """Count for each of n numbers the equal ones before it, ``(n,)``."""
-    counts, order = numbers.bincount(), numbers.argsort(stable=True)
-    first = (counts.cumsum(0) - counts)[numbers[order]]
-    place = torch.empty_like(numbers)
-    place[order] = torch.arange(len(numbers), device=numbers.device) - first
-    return place

@@ -1,19 +1,18 @@
 """Mixtures over simulations, such as the posterior of RoPE."""
 
-import hashlib
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from dataclasses import replace
+from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from sbi_rope.coupling import Coupling
 from sbi_rope.density.base import Accept, Density, batches, num_fitting, without_nan
-from sbi_rope.npe.sbi import ConditionalDensityEstimator, embed, readable
-from sbi_rope.npe.standardisation import warn_of_far_entries
+from sbi_rope.npe.sbi import ConditionalDensityEstimator
 from sbi_rope.training.ensemble import drawn, log_density
-from sbi_rope.utils.errors import InvalidInputError, warn_user
+from sbi_rope.utils.errors import InvalidInputError
 
 
 class OverSimulations(Density):
@@ -87,10 +86,10 @@ class OverSimulations(Density):
             [drawn(self.density, self.simulated[k]) for k in batches(column)]
         )
 
-    def mass(self, z: Tensor, num_rows: int, accept: Accept, **options: Any) -> Tensor:
+    def mass(self, z: Tensor, num_rows: int, accept: Accept) -> Tensor:
         """Estimate masses row by row, so that they are the same in any batch."""
         estimate = super().mass
-        return torch.cat([estimate(one, 1, accept, **options) for one in z.split(1)])
+        return torch.cat([estimate(one, 1, accept) for one in z.split(1)])
 
 
 class Coupled(OverSimulations):
@@ -108,64 +107,36 @@ class Coupled(OverSimulations):
 
     Args:
         density: :math:`q(\theta \mid s)`.
-        simulated: :math:`h(x_s)`, shape ``(n_s, l)``.
         x_o: The real observations that were coupled, shape ``(n_o, *event)``.
-        net: The embedding net g of real observations.
-        coupling: The coupling of :math:`g(x_o)` with the simulations.
-        unseen: What to do with an x outside the batch: ``"raise"`` an error, or
-            ``"extend"`` the coupling by a row under the same potential.
+        coupling: The coupling of :math:`g(x_o)` with :math:`h(x_s)`.
     """
 
     x_o: Tensor
 
     def __init__(
-        self,
-        density: ConditionalDensityEstimator,
-        simulated: Tensor,
-        x_o: Tensor,
-        net: nn.Module,
-        coupling: Coupling,
-        *,
-        unseen: Literal["raise", "extend"] = "raise",
+        self, density: ConditionalDensityEstimator, x_o: Tensor, coupling: Coupling
     ) -> None:
-        super().__init__(density, simulated, x_o.shape[1:])
-        self.net = net
+        super().__init__(density, coupling.simulated.to(x_o), x_o.shape[1:])
         self.coupling = coupling
-        self.unseen: Literal["raise", "extend"] = unseen
         self.register_buffer("x_o", x_o)
         # Backwards, so that of equal observations the first is found.
         self._index = {key: i for i, key in reversed([*enumerate(_keys(x_o))])}
 
-    def embed(self, x: Tensor) -> Tensor:
-        """Embed observations, ``(n, *event)`` to ``(n, l)``."""
-        x = x.to(self.x_o)
-        index = torch.tensor([self._index.get(key, -1) for key in _keys(x)]).to(
-            x.device
-        )
-        z, new = self.coupling.real[index.clamp_min(0)], index < 0
-        if new.any():
-            z[new] = self._extended(x[new])
-        return z
+    def __getitem__(self, index: int) -> "Coupled":
+        """Return the same mixture for one of the observations alone."""
+        number = range(len(self.x_o))[index]
+        coupling = replace(self.coupling, real=self.coupling.real[number][None])
+        return Coupled(self.density, self.x_o[number][None], coupling)
 
-    def _extended(self, x: Tensor) -> Tensor:
-        if self.unseen == "raise":
+    def embed(self, x: Tensor) -> Tensor:
+        """Return the embeddings of observations of the batch, ``(n, l)``."""
+        index = [self._index.get(key, -1) for key in _keys(x.to(self.x_o))]
+        if -1 in index:
             raise InvalidInputError(
                 f"Expected `x` of the batch that this posterior was built for; got "
-                f"{len(x)} others. Couple them with `rope.build_posterior(x)`."
+                f"{index.count(-1)} others. Couple them with `rope.build_posterior(x)`."
             )
-        warn_of_far_entries("x", x, self.net)
-        z = embed(self.net, x).to(self.coupling.real)
-        smallest = float((1 / self.rows(z).square().sum(dim=1)).min())
-        warn_user(
-            f"Extended the coupling to {len(x)} unseen observation(s). The smallest "
-            f"effective sample size is {smallest:.1f} of {len(self.simulated)} "
-            "simulations. If it is below about 50, couple the new batch instead."
-        )
-        return z
-
-    def readable(self, x: Tensor) -> Tensor:
-        """Tell which observations can be read by the net."""
-        return readable(self.net, x)
+        return self.coupling.real[index]
 
     def rows(self, z: Tensor) -> Tensor:
         """Return the weights of the simulations, ``(b, n_s)``; rows sum to one."""
@@ -195,21 +166,16 @@ def _chosen(weights: Tensor, row: Tensor) -> Tensor:
     The cumulative weights of row i fill the interval [i, i + 1], so that one search
     serves all rows. The offset i costs digits, hence the double precision.
     """
-    count = weights.shape[1]
     cumulative = weights.cumsum(dim=1, dtype=torch.double)
     cumulative /= cumulative[:, -1:].clone()
     cumulative += torch.arange(len(weights), device=row.device)[:, None]
-    # The last column of each row with a weight: rounding may carry a draw past it.
-    last = count - 1 - (weights > 0).flip(1).to(torch.int8).argmax(dim=1)
-    uniform = torch.rand(len(row), dtype=torch.double, device=row.device)
+    # Below one, so that rounding carries no draw past the last weight of its row.
+    uniform = torch.rand(len(row), dtype=torch.double, device=row.device) * (1 - 1e-9)
     # right=True skips columns with a weight of zero.
     found = torch.searchsorted(cumulative.flatten(), uniform + row, right=True)
-    return torch.minimum((found - row * count).clamp_min_(0), last[row])
+    return found - row * weights.shape[1]
 
 
 def _keys(x: Tensor) -> list[bytes]:
-    """Return a fingerprint of each row's values."""
-    # Adding zero turns -0.0 into 0.0. NaN may have different bits, too.
-    rows = x.detach().cpu().flatten(1) + 0.0
-    rows = rows.where(~rows.isnan(), torch.nan).contiguous().numpy()
-    return [hashlib.blake2b(row.tobytes(), digest_size=16).digest() for row in rows]
+    """Return the values of each observation; adding zero turns -0.0 into 0.0."""
+    return [row.tobytes() for row in (x.detach().cpu() + 0.0).numpy()]

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from sbi_rope.density.base import Density, batches, places, without_nan
+from sbi_rope.density.base import Density, batches, without_nan
 from sbi_rope.npe.sbi import (
     ConditionalEstimator,
     embedding_of,
@@ -93,10 +93,9 @@ class Flow(Density):
             same = all(all(map(torch.equal, first, other)) for other in others)
             if same and all(len(one) == 1 for one in parts):
                 return copy.deepcopy(parts[0])
-            sizes = [flow.num_members for flow in flows]
             full = [
-                one if len(one) > 1 else one[[0] * size]
-                for one, size in zip(parts, sizes, strict=True)
+                one if len(one) > 1 else one[[0] * flow.num_members]
+                for one, flow in zip(parts, flows, strict=True)
             ]
             return Ensemble.joined(full)
 
@@ -133,17 +132,11 @@ class Flow(Density):
     ) -> "Flow":
         return Flow(nets, densities, self.input_shape, self.condition_shape, weights)
 
-    def estimator(self, like: ConditionalEstimator | None = None) -> Any:
+    def estimator(self, like: ConditionalEstimator) -> Any:
         """Return the first flow as an estimator of sbi, of the class of ``like``."""
-        density, net = self.densities.member(0), self.nets.member(0)
-        if like is None:
-            shape = self.condition_shape
-            return with_embedding(density, net, condition_shape=shape).eval()
-        copied = copy.deepcopy(like)
+        copied, density = copy.deepcopy(like), self.densities.member(0)
         headless(copied).load_state_dict(density.state_dict())  # shares its tensors
-        return with_embedding(copied, net).eval()
-
-    # --- training ---
+        return with_embedding(copied, self.nets.member(0)).eval()
 
     def losses(self, theta: Tensor, x: Tensor) -> Tensor:
         """Return the losses ``(E, B)`` at theta ``(E, B, d)``, x ``(E, B, *event)``."""
@@ -157,8 +150,6 @@ class Flow(Density):
         """Return the losses at embedded observations, shape ``(E, B, l)``."""
         losses = self.densities.answer(loss_of, theta.flatten(0, 1), z.flatten(0, 1))
         return losses.reshape(theta.shape[:2])
-
-    # --- density ---
 
     @torch.no_grad()
     def embed(self, x: Tensor) -> Tensor:
@@ -198,7 +189,8 @@ class Flow(Density):
                 theta.append(self.densities.answer(drawn, conditions))
                 continue
             # Each member draws for its own rows, padded to the same number for all.
-            place = places(member)
+            count = nn.functional.one_hot(member).cumsum(dim=0)
+            place = count.gather(1, member[:, None])[:, 0] - 1
             padded = row.new_zeros(self.num_members, int(place.max()) + 1)
             padded[member, place] = torch.arange(len(some), device=row.device)
             of_all = self.densities.answer(drawn, conditions[padded].flatten(0, 1))

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from sbi_rope.density.base import Accept, Density
+from sbi_rope.density.base import Density
 from sbi_rope.density.flow import Flow
 from sbi_rope.density.posterior import MixturePosterior
 from sbi_rope.npe.sbi import check_density, estimator_of
@@ -19,8 +19,7 @@ class Mixture(Density):
     .. math:: \sum_k w_k\, q_k(\theta \mid x)
 
     Args:
-        parts: :math:`q_k`. The parts of a mixture among them become parts of this one.
-            All have the same shapes of theta and x.
+        parts: :math:`q_k`, all with the same shapes of theta and x.
         weights: :math:`w_k`, with a sum of one. A part of weight zero is left out.
     """
 
@@ -30,16 +29,10 @@ class Mixture(Density):
         self, parts: Sequence[Density], weights: Sequence[float] | Tensor
     ) -> None:
         super().__init__(parts[0].input_shape, parts[0].condition_shape)
-        shares = torch.as_tensor(weights, dtype=torch.double).tolist()
-        flat: list[tuple[Density, float]] = []
-        for part, weight in zip(parts, shares, strict=True):
-            inner = [(part, 1.0)]
-            if isinstance(part, Mixture):
-                inner = zip(part.parts, part.weights.tolist(), strict=True)
-            flat += [(own, weight * w) for own, w in inner if weight * w]
-        self.parts: Any = nn.ModuleList(part for part, _ in flat)
-        used = torch.tensor([w for _, w in flat], dtype=torch.double)
-        self.register_buffer("weights", used.to(parts[0].device))
+        shares = torch.as_tensor(weights, dtype=torch.double)
+        used = shares.nonzero().flatten().tolist()
+        self.parts: Any = nn.ModuleList(parts[k] for k in used)
+        self.register_buffer("weights", shares[used].to(parts[0].device))
 
     def embed(self, x: Tensor) -> list[Any]:
         """Return what each part keeps of observations."""
@@ -67,18 +60,6 @@ class Mixture(Density):
     def readable(self, x: Tensor) -> Tensor:
         """Tell which observations can be embedded by all parts."""
         return torch.stack([part.readable(x) for part in self.parts]).all(dim=0)
-
-    def mass(
-        self, z: list[Any], num_rows: int, accept: Accept, **options: Any
-    ) -> Tensor:
-        """Return the weighted sum of masses, each of its share of the draws."""
-        of_each = [
-            part.mass(own, num_rows, accept, share=float(weight), seed=k)
-            for k, (part, weight, own) in enumerate(
-                zip(self.parts, self.weights, z, strict=True)
-            )
-        ]
-        return torch.stack(of_each, dim=1) @ self.weights
 
 
 def density_of(posterior: Any, *, what: str = "a posterior") -> Density:

@@ -1,8 +1,6 @@
 """A density as an sbi posterior: the prior's support, normalisation, the batch."""
 
-import copy
-import operator
-import time
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -11,7 +9,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_rope.coupling import Coupling
-from sbi_rope.density.base import DTYPE, MAX_ENTRIES, Accept, Density, Prior
+from sbi_rope.density.base import MAX_ENTRIES, Accept, Density, Prior
 from sbi_rope.density.coupled import Coupled
 from sbi_rope.density.sets import MakesSets
 from sbi_rope.npe.prior import PriorDistribution
@@ -20,7 +18,7 @@ from sbi_rope.npe.standardisation import warn_of_far_entries
 from sbi_rope.utils.errors import InvalidInputError, SamplingError
 from sbi_rope.utils.progress import is_shown, progress_bar
 from sbi_rope.utils.seeds import seeded
-from sbi_rope.utils.settings import Count, Positive, check
+from sbi_rope.utils.settings import Count, check
 from sbi_rope.utils.tensors import as_batch, as_numbers, rows_with
 
 # Rejection sampling gives up on observations of which, after MIN_OF_ROW proposals, less
@@ -29,8 +27,6 @@ from sbi_rope.utils.tensors import as_batch, as_numbers, rows_with
 # which are minutes. In a stack the prior often keeps a share just below MIN_ACCEPTANCE.
 MIN_OF_ROW, MIN_PROPOSALS, MAX_PROPOSALS = 5_000, 100_000, 10_000_000
 MIN_ACCEPTANCE = 1e-3
-# Where all were rejected, the share inside is taken for that of so many.
-PSEUDO_COUNT = 0.1
 # A flow takes about as long for this many draws as for a single one.
 SMALL_BATCH = 512
 
@@ -42,20 +38,10 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         p(\theta \mid x)
         = \frac{\mathbf{1}[\theta \in \operatorname{supp} p]}{Z(x)}\, q(\theta \mid x),
 
-    with Z(x) the mass inside the support of the prior. For RoPE,
-
-    .. math::
-        q(\theta \mid x_{o,i}) = \sum_j \alpha_{ij}\, q(\theta \mid h(x_{s,j})),
-        \qquad Z_i = \sum_j \alpha_{ij} Z_j .
-
-    It has all methods of sbi's :class:`DirectPosterior` and works with sbi's
-    diagnostics. That of RoPE belongs to a batch of observations, its ``x_o``. Others
-    are amortised and answer any x.
-
-    References:
-        | Addressing Misspecification in Simulation-based Inference through Data-driven
-          Calibration (Wehenkel et al., 2025), eq. 5
-        | https://arxiv.org/abs/2405.08719
+    with Z(x) the mass inside the support of the prior. It has all methods of sbi's
+    :class:`DirectPosterior` and works with sbi's diagnostics. That of RoPE (see
+    :class:`~sbi_rope.density.Coupled`) belongs to a batch, its ``x_o``. Others are
+    amortised and answer any x.
 
     Args:
         density: q.
@@ -71,10 +57,6 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
     x_names: tuple[str, ...] | None = None
     # Whether an amortised posterior warns of entries that are far from simulations.
     warns = True
-    # From which to which observation of the batch it belongs to.
-    _rows: tuple[int | None, ...] = (None,)
-    # The observations that the mass was last estimated for, and this mass.
-    _latest: tuple[Tensor, Tensor] | None = None
 
     def __init__(
         self,
@@ -94,10 +76,6 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
                 enable_transform=enable_transform and not is_mixed,
             )
 
-    def __str__(self) -> str:
-        of = "any x" if self.is_amortised else f"each of {len(self)} x"
-        return f"{type(self).__name__} p(θ|x) of {of}"
-
     # --- the batch ---
 
     @property
@@ -108,7 +86,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
     @property
     def x_o(self) -> Tensor:
         """The batch of real observations, shape ``(n_o, *event)``."""
-        return self._coupled.x_o[slice(*self._rows)]
+        return self._coupled.x_o
 
     @property
     def coupling(self) -> Coupling:
@@ -118,7 +96,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
     @property
     def weights(self) -> Tensor:
         """Weights of the simulations, shape ``(n_o, n_s)``."""
-        return self.coupling.weights[slice(*self._rows)]
+        return self.coupling.weights
 
     @property
     def _coupled(self) -> Coupled:
@@ -136,21 +114,14 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         return True  # also an amortised one, which has no length
 
     def __getitem__(self, index: int) -> "MixturePosterior":
-        """Return the posterior of one observation alone, which is its default x."""
-        x, view = self.x_o[operator.index(index)], copy.copy(self)
-        first = range(len(self._coupled.x_o))[slice(*self._rows)][index]
-        view._rows = (first, first + 1)
-        view.potential_fn = copy.copy(self.potential_fn)  # which holds an x
-        return view.set_default_x(x)
+        """Return the posterior of one observation alone, which is its default x.
 
-    def to(self, device: str | torch.device) -> None:
-        """Move the posterior, its coupling and its batch to a device.
-
-        Posteriors of single observations (``posterior[i]``) have to be taken again.
+        Take it anew when the whole has moved to another device.
         """
-        self._latest = None
-        with seeded(0):  # sbi draws from the prior to find out about it
-            super().to(device)
+        own, transform = self._coupled[index], self.enable_transform
+        one = MixturePosterior(own, self.prior, enable_transform=transform)
+        one.parameter_names, one.x_names = self.parameter_names, self.x_names
+        return one.set_default_x(own.x_o)
 
     # --- arguments ---
 
@@ -166,15 +137,17 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         """Return observations ``(n, *event)``; warn of those far from simulations."""
         density = self.posterior_estimator
         event = density.condition_shape
-        x = as_numbers("x", x, names=self.x_names).to(DTYPE)
+        x = as_numbers("x", x, names=self.x_names).float()
         x = x[None] if x.shape == event else x
         x = as_batch("x", x, event, rows=rows, finite=False).to(density.device)
+        if not self.is_amortised:  # RoPE has checked its batch
+            return x
         if not torch.isfinite(x).all() and (unread := ~density.readable(x)).any():
             raise InvalidInputError(
                 "Expected `x` without NaN or Inf that the embedding net cannot read; "
                 f"got {rows_with(unread)}."
             )
-        if self.warns and self.is_amortised:  # RoPE has warned of its batch
+        if self.warns:
             warn_of_far_entries("x", x, density)
         return x
 
@@ -191,7 +164,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
                 f"Expected `theta` of shape ({batch}, {dim}) without NaN; got {shape}."
             )
         # A bound of the prior is one in float32 only: 0.1 of float64 is below it.
-        return theta.to(self.posterior_estimator.device, DTYPE)
+        return theta.to(self.posterior_estimator.device, torch.float32)
 
     # --- samples ---
 
@@ -206,6 +179,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         x = self._one_x(x)
         return self.sample_batched(sample_shape, x, *args, **options).squeeze(-2)
 
+    @torch.no_grad()
     def sample_batched(  # type: ignore[override]
         self,
         sample_shape: Any,
@@ -213,7 +187,6 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         max_sampling_batch_size: int | None = None,
         show_progress_bars: bool | None = None,  # noqa: FBT001
         reject_outside_prior: bool = True,  # noqa: FBT001, FBT002
-        max_sampling_time: float | None = None,
     ) -> Tensor:
         r"""Draw from :math:`p(\theta \mid x_b)` of every observation of a batch.
 
@@ -225,46 +198,32 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
                 None does so in a terminal or a notebook, but not in a file.
             reject_outside_prior: Whether to draw from the density truncated to the
                 prior's support, or from the whole density.
-            max_sampling_time: Seconds after which to give up; None for no limit.
 
         Returns:
             Shape ``(*sample_shape, B, d)``.
 
         Raises:
-            InvalidInputError: If an x is not in the batch and ``unseen="raise"``.
-            SamplingError: If hardly any mass lies inside the prior's support, or the
-                time is over.
+            InvalidInputError: If there is a batch, and an x is not in it.
+            SamplingError: If hardly any mass lies inside the prior's support.
         """
-        check("max_sampling_time", max_sampling_time, Positive | None)
         check("max_sampling_batch_size", max_sampling_batch_size, Count | None)
         x, density = self._batch_of_x(x), self.posterior_estimator.eval()
-        z, num_rows, shape = density.embed(x), len(x), torch.Size(sample_shape)
+        draw = functools.partial(density.draw, density.embed(x))
+        shape, num_rows = torch.Size(sample_shape), len(x)
         num_samples = shape.numel()
-        total, start = num_samples * num_rows, time.monotonic()
-
-        def draw(row: Tensor) -> Tensor:
-            if max_sampling_time and time.monotonic() > start + max_sampling_time:
-                raise SamplingError(
-                    "Sampling took longer than `max_sampling_time`: not all of "
-                    f"{total} draws were made."
-                )
-            return density.draw(z, row)
-
+        total = num_samples * num_rows
         size = min(MAX_ENTRIES, max_sampling_batch_size or MAX_ENTRIES)
-        propose: Callable[[Tensor], Tensor] = draw
         if reject_outside_prior:
-            propose = rejecting(draw, self.prior.inside, num_rows, size)
+            counts = torch.zeros(2, num_rows, dtype=torch.long)
+            draw = functools.partial(accepted, draw, self.prior.inside, counts, size)
         theta = torch.empty(total, *density.input_shape, device=density.device)
         # Observation by observation, so that few of them are needed at a time.
         slots = torch.arange(total, device=theta.device).split(size)
         show = is_shown(show_progress_bars)
-        with (
-            torch.no_grad(),
-            progress_bar(show=show, desc="Sampling", total=total) as bar,
-        ):
+        with progress_bar(show=show, desc="Sampling", total=total) as bar:
             for slot in slots if total else ():
                 row, number = slot // num_samples, slot % num_samples
-                theta[number * num_rows + row] = propose(row)
+                theta[number * num_rows + row] = draw(row)
                 bar.update(len(slot))
         return theta.reshape(*shape, num_rows, *density.input_shape)
 
@@ -289,7 +248,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             Shape ``(n,)``; minus infinity outside the prior's support.
 
         Raises:
-            InvalidInputError: If x is not in the batch and ``unseen="raise"``.
+            InvalidInputError: If there is a batch, and x is not in it.
             SamplingError: If the density has no mass inside the prior's support.
         """
         theta, x = self._parameters(theta, most_dims=2)[:, None], self._one_x(x)
@@ -325,7 +284,7 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
         if norm_posterior:
             log_prob = log_prob - self._normaliser(x, z).log()
         inside = inside.reshape(theta.shape[:2])
-        return log_prob.to(DTYPE).where(inside, -torch.inf)
+        return log_prob.float().where(inside, -torch.inf)
 
     def map(self, x: Tensor | None = None, **options: Any) -> Tensor:  # type: ignore[override]
         """Return the maximum of the density given the default x, as in sbi, ``(1, d)``.
@@ -350,13 +309,11 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
             SamplingError: If one of the masses is zero.
         """
         x = self._batch_of_x(x)
-        return self._normaliser(x, self.posterior_estimator.embed(x)).to(DTYPE)
+        return self._normaliser(x, self.posterior_estimator.embed(x)).float()
 
     def _normaliser(self, x: Tensor, z: Any) -> Tensor:
         if self.prior.is_unbounded:
             return torch.ones(len(x), dtype=torch.double, device=x.device)
-        if self._latest is not None and torch.equal(self._latest[0], x):
-            return self._latest[1]
         mass = self.posterior_estimator.mass(z, len(x), self.prior.inside)
         if not (mass > 0).all():
             rows = (mass <= 0).nonzero().flatten()
@@ -364,51 +321,55 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
                 f"The densities of rows {rows[:5].tolist()} of `x` have no mass inside "
                 "the support of the prior. Leave them out, or train NPE longer."
             )
-        self._latest = x.clone(), mass
         return mass
 
 
-def rejecting(
-    draw: Callable[[Tensor], Tensor], accept: Accept, num_rows: int, size: int
-) -> Callable[[Tensor], Tensor]:
-    """Return a function that draws for rows until one of each is accepted."""
-    proposed, inside = torch.zeros(2, num_rows, dtype=torch.long)
+def accepted(
+    draw: Callable[[Tensor], Tensor],
+    accept: Accept,
+    counts: Tensor,
+    size: int,
+    row: Tensor,
+) -> Tensor:
+    """Draw for each of n numbers of rows until one is accepted, ``(n, d)``.
 
-    def accepted(row: Tensor) -> Tensor:
-        theta, rate = torch.empty(0), 1.0
-        left = torch.arange(len(row), device=row.device)
-        while count := len(left):
-            # For the last few, more proposals take no longer than one.
-            wanted = max(int(1 / max(rate, MIN_ACCEPTANCE)), SMALL_BATCH // count)
-            repeats = max(1, min(wanted, size // count))
-            rows = row[left].repeat_interleave(repeats)
-            draws = draw(rows)
-            fits = accept(draws)
-            if not len(theta):
-                theta = draws.new_empty(len(row), *draws.shape[1:])
-            rate = float(fits.double().mean())
-            proposed.add_(rows.bincount(minlength=num_rows).cpu())
-            inside.add_(rows[fits].bincount(minlength=num_rows).cpu())
-            # Of several proposals for one the first that fits is kept.
-            fits = fits.reshape(count, repeats)
-            found, first = fits.any(dim=1), fits.byte().argmax(dim=1)
-            first = first + repeats * torch.arange(count, device=row.device)
-            theta[left[found]] = draws[first[found]]
-            left = left[~found]
-            missing = row[left].bincount(minlength=num_rows).cpu()
-            is_slow = (missing > 0) & (proposed >= MIN_OF_ROW)
-            is_slow &= inside < MIN_ACCEPTANCE * proposed
-            further = (missing * proposed / (inside + PSEUDO_COUNT))[is_slow].sum()
-            if proposed[is_slow].sum() >= MIN_PROPOSALS and further > MAX_PROPOSALS:
-                numbers = is_slow.nonzero().flatten()[:5].tolist()
-                raise SamplingError(
-                    f"Less than one in {1 / MIN_ACCEPTANCE:g} draws lies inside the "
-                    f"support of the prior for rows {numbers} of `x`. Leave these out, "
-                    "train NPE longer, or pass reject_outside_prior=False."
-                )
-        return theta
-
-    return accepted
+    At most ``size`` draws are made at a time. The ``counts`` of proposed and accepted
+    draws of each row, ``(2, B)``, go on from call to call.
+    """
+    (proposed, inside), num_rows = counts, counts.shape[1]
+    theta, rate = torch.empty(0), 1.0
+    left = torch.arange(len(row), device=row.device)
+    while count := len(left):
+        # For the last few, more proposals take no longer than one.
+        wanted = max(int(1 / max(rate, MIN_ACCEPTANCE)), SMALL_BATCH // count)
+        repeats = max(1, min(wanted, size // count))
+        rows = row[left].repeat_interleave(repeats)
+        draws = draw(rows)
+        fits = accept(draws)
+        if not len(theta):
+            theta = draws.new_empty(len(row), *draws.shape[1:])
+        rate = float(fits.double().mean())
+        proposed += rows.bincount(minlength=num_rows).cpu()
+        inside += rows[fits].bincount(minlength=num_rows).cpu()
+        # Of several proposals for one the first that fits is kept.
+        fits = fits.reshape(count, repeats)
+        found, first = fits.any(dim=1), fits.byte().argmax(dim=1)
+        draws = draws.unflatten(0, fits.shape)
+        theta[left[found]] = draws[found, first[found]]
+        left = left[~found]
+        missing = row[left].bincount(minlength=num_rows).cpu()
+        is_slow = (missing > 0) & (proposed >= MIN_OF_ROW)
+        is_slow &= inside < MIN_ACCEPTANCE * proposed
+        # Where all were rejected, a tenth of a draw counts as accepted.
+        further = (missing * proposed / (inside + 0.1))[is_slow].sum()
+        if proposed[is_slow].sum() >= MIN_PROPOSALS and further > MAX_PROPOSALS:
+            numbers = is_slow.nonzero().flatten()[:5].tolist()
+            raise SamplingError(
+                f"Less than one in {1 / MIN_ACCEPTANCE:g} draws lies inside the "
+                f"support of the prior for rows {numbers} of `x`. Leave these out, "
+                "train NPE longer, or pass reject_outside_prior=False."
+            )
+    return theta
 
 
 class PriorPosterior(MixturePosterior):
@@ -416,11 +377,6 @@ class PriorPosterior(MixturePosterior):
 
     ``sample`` and ``log_prob`` need no observation, and the batched methods take
     observations of any shape.
-
-    References:
-        | Addressing Misspecification in Simulation-based Inference through Data-driven
-        | Calibration (Wehenkel et al., 2025), section 4, Baselines
-        | https://arxiv.org/abs/2405.08719
 
     Args:
         prior: A torch distribution over parameters of shape ``(d,)``. It is copied.

@@ -28,7 +28,6 @@ from sbi_rope.utils.tensors import as_batch, as_numbers
 
 LOWEST_LEVEL = 0.5  # Below, the guarantee says nothing, and intervals may be empty.
 MAX_PRINTED = 20  # intervals
-NO_GUARANTEE = "There is no guarantee. The level is right for calibrated posteriors."
 
 
 def joint_scores(log_prob: Tensor, draws: Tensor) -> Tensor:
@@ -54,47 +53,41 @@ def marginal_scores(theta: Tensor, draws: Tensor) -> Tensor:
     r"""Return the level :math:`|2 F(\theta) - 1|` of the central interval up to theta.
 
     F is m / (M + 1) at the m-th smallest of M draws, ``(*batch, M)``, and linear
-    between them. Beyond them its slope is one over their range. Where draws are equal F
-    jumps, and the score is the smallest along the jump. (Chernozhukov et al., 2021,
-    arXiv 1909.07889)
+    between them. Beyond them its slope is one over their range. Of equal draws the
+    smallest number m counts. (Chernozhukov et al., 2021, arXiv 1909.07889)
     """
     theta, draws = theta.double().contiguous(), _ordered(draws)
     last = draws.shape[-1] - 1
     left = torch.searchsorted(draws, theta)
-    right = torch.searchsorted(draws, theta, right=True)
     before = draws.gather(-1, (left - 1).clamp(0, last))
     after = draws.gather(-1, left.clamp(0, last))
-    between = left + (theta - before) / torch.where(after > before, after - before, 1.0)
-    start = between.clamp_min(1) / (last + 2)
-    end = torch.maximum(between, right) / (last + 2)
-    inside = torch.maximum(2 * start - 1, 1 - 2 * end).clamp_min(0.0)
-    lowest, highest = draws[..., :1], draws[..., -1:]
-    distance = torch.maximum(lowest - theta, theta - highest)
-    beyond = last / (last + 2) + 2 * distance / (highest - lowest)
+    place = left + (theta - before) / torch.where(after > before, after - before, 1.0)
+    inside = (2 * place.clamp_min(1) / (last + 2) - 1).abs()
+    distance = torch.maximum(draws[..., :1] - theta, theta - draws[..., -1:])
+    beyond = last / (last + 2) + 2 * distance / _range(draws)
     return torch.where(distance > 0, beyond, inside)
 
 
 def marginal_ends(scores: Tensor, draws: Tensor) -> Tensor:
     """Return the ends, ``(2, *batch, k)``, between which marginal scores are lower."""
-    draws, scores = _ordered(draws), scores.double()
+    draws = _ordered(draws)
     last = draws.shape[-1] - 1
-    ends = []
-    for sign in (-1, 1):
-        position = (1 + sign * scores) / 2 * (last + 2) - 1
-        start = position.floor().clamp(0, max(last - 1, 0)).long()
-        low = draws.gather(-1, start)
-        high = draws.gather(-1, (start + 1).clamp_max(last))
-        inside = low + (position.clamp(0, last) - start) * (high - low)
-        beyond = (position - position.clamp(0, last)) / (last + 2)
-        moved = beyond * (draws[..., -1:] - draws[..., :1])
-        # Infinitely many ranges of zero are infinite, as the score is.
-        ends.append(inside + torch.where(beyond.isinf(), beyond, moved))
-    return torch.stack(ends)
+    draws = draws.expand(2, *draws.shape)
+    position = (1 + torch.stack([-scores, scores]).double()) / 2 * (last + 2) - 1
+    start = position.floor().clamp(0, max(last - 1, 0)).long()
+    low, high = (draws.gather(-1, at) for at in (start, (start + 1).clamp_max(last)))
+    inside = low + (position.clamp(0, last) - start) * (high - low)
+    beyond = (position - position.clamp(0, last)) / (last + 2)
+    return inside + beyond * _range(draws)
 
 
 def _ordered(draws: Tensor) -> Tensor:
     """Return draws in order; torch searches rows that are contiguous without a copy."""
     return draws.double().contiguous().sort().values
+
+
+def _range(draws: Tensor) -> Tensor:
+    return (draws[..., -1:] - draws[..., :1]).clamp_min(1e-9)  # draws may be equal
 
 
 def _round_up(number: float) -> int:
@@ -116,57 +109,6 @@ def is_held(scores: Tensor, fold: Tensor, at_theta: Tensor, *, rank: int) -> Ten
     for score, number in zip(scores, fold.tolist(), strict=True):
         below += score < at_theta[number]
     return below < rank
-
-
-@dataclass(frozen=True, kw_only=True)
-class Guarantee:
-    r"""The promise of a set or interval, for observations drawn as the pairs were.
-
-    Suppose that the calibration pairs and the new observation with its parameters are
-    exchangeable, as independent draws from one distribution are. The set then holds
-    the parameters with a probability of at least
-
-    .. math:: 1 - 2 \alpha - \min\Big\{ \frac{2 (1 - 1/K)}{n/K + 1},
-        \frac{1 - K/n}{K + 1} \Big\}, \qquad \alpha = 1 - \text{level},
-
-    in theory, and of about the level in practice, on average over calibration sets and
-    observations. The theorem is for folds of equal size, and candidates of a stack. The
-    weights of the stack have seen the labels of a fold, which changes the coverage by
-    less than one per cent in simulations with 10 to 50 pairs. Parameters beyond the
-    support of the prior are missed in addition.
-
-    References:
-        | Predictive Inference with the Jackknife+ (Barber et al., 2021), theorem 4
-        | https://arxiv.org/abs/1905.02928
-
-    Attributes:
-        level: The level that was asked for.
-        num_pairs: The number n of pairs with exact labels, one of each group.
-        num_folds: The number K of folds.
-    """
-
-    level: float
-    num_pairs: int
-    num_folds: int
-
-    @property
-    def lower_bound(self) -> float:
-        """The least probability in theory; 0 if theory promises nothing."""
-        # Folds without a counted pair change nothing.
-        n, num_folds = self.num_pairs, min(self.num_folds, self.num_pairs)
-        of_folds = 2 * (1 - 1 / num_folds) / (n / num_folds + 1)
-        of_pairs = (1 - num_folds / n) / (num_folds + 1)
-        return max(0.0, 1 - 2 * (1 - self.level) - min(of_folds, of_pairs))
-
-    def __str__(self) -> str:
-        return (
-            f"For observations drawn as the {self.num_pairs} calibration pairs were, "
-            f"the truth is inside in about {self.level:.4g} of the cases, and in at "
-            f"least {self.lower_bound:.3f} of them in theory, on average over "
-            "observations and calibration sets."
-        )
-
-    __repr__ = __str__  # which notebooks show
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -204,15 +146,15 @@ class SetScores:
         """
         return float(self.joint.kthvalue(rank_needed(level, len(self))).values)
 
-    def guarantee(self, level: float) -> Guarantee:
-        """Return the guarantee of a level; raise if the pairs cannot give it."""
-        n = len(self)
-        if level < LOWEST_LEVEL or rank_needed(level, n) > n:
+    def rank(self, level: float) -> int:
+        """Return ``rank_needed`` for a guarantee; raise if the pairs cannot give it."""
+        n, rank = len(self), rank_needed(level, len(self))
+        if level < LOWEST_LEVEL or rank > n:
             raise InvalidInputError(
                 f"Expected `level` from {LOWEST_LEVEL} to {n / (n + 1):.3g}, as {n} "
                 f"exact labels of different groups can guarantee; got {level:g}."
             )
-        return Guarantee(level=level, num_pairs=n, num_folds=len(self.weights))
+        return rank
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -225,8 +167,8 @@ class CredibleSet:
 
     Attributes:
         level: The level that was asked for.
-        guarantee: The guarantee, of the set and of each interval; None if there is
-            none.
+        guarantee: What is promised of the set and of each interval, in words; None if
+            nothing is.
         low: The lower ends of the intervals, shape ``(d,)``, or ``(B, d)`` of a batch.
         high: The upper ends, as ``low``.
         rule: Tells which parameters ``(n, B, d)`` are in the sets, ``(n, B)``.
@@ -234,7 +176,7 @@ class CredibleSet:
     """
 
     level: float
-    guarantee: Guarantee | None
+    guarantee: str | None
     low: Tensor
     high: Tensor
     rule: Callable[[Tensor], Tensor]
@@ -284,7 +226,8 @@ class CredibleSet:
             lines.append(f"  and {len(rows) - MAX_PRINTED} more")
         if self.low.shape[-1] > 1:
             lines.append("All parameters together are inside less often.")
-        return "\n".join([*lines, str(self.guarantee or NO_GUARANTEE)])
+        no = "There is no guarantee. The level is right for calibrated posteriors."
+        return "\n".join([*lines, self.guarantee or no])
 
     __repr__ = __str__  # which notebooks show
 
@@ -308,7 +251,19 @@ class MakesSets:
         quantile of the log density of draws, and the intervals are the central ones of
         draws. They hold the true parameters with the probability ``level`` only if the
         posterior is calibrated. With ``guaranteed``, a stack corrects them by its
-        out-of-fold scores, see :class:`~sbi_rope.density.sets.Guarantee`.
+        out-of-fold scores. Suppose that the n calibration pairs, in K folds, and the
+        new observation with its parameters are exchangeable, as independent draws are.
+        The probability is then about ``level`` in practice, on average over calibration
+        sets and observations, and, up to the weights of the stack, in theory at least
+
+        .. math:: 1 - 2 \alpha - \min\Big\{ \frac{2 (1 - 1/K)}{n/K + 1},
+            \frac{1 - K/n}{K + 1} \Big\}, \qquad \alpha = 1 - \text{level}.
+
+        Parameters beyond the support of the prior are missed in addition.
+
+        References:
+            | Predictive Inference with the Jackknife+ (Barber et al., 2021), theorem 4
+            | https://arxiv.org/abs/1905.02928
 
         Args:
             level: The probability of the set, and of each interval by itself.
@@ -329,12 +284,9 @@ class MakesSets:
         check("level", level, Level)
         check("num_samples", num_samples, Count)
         density = self.posterior_estimator
-        shape: tuple[int, ...] = tuple(density.input_shape)
-        if x is None or np.ndim(x) == len(density.condition_shape):
-            x = self._one_x(x)
-        else:
-            x = self._batch_of_x(x)
-            shape = (len(x), *shape)
+        is_one = x is None or np.ndim(x) == len(density.condition_shape)
+        x = self._one_x(x) if is_one else self._batch_of_x(x)
+        shape = density.input_shape if is_one else (len(x), *density.input_shape)
         make = _guaranteed if guaranteed else _of_draws
         with seeded(seed), torch.no_grad():
             guarantee, low, high, rule = make(self, level, x, num_samples)
@@ -377,7 +329,12 @@ def _of_draws(posterior: Any, level: float, x: Tensor, num_samples: int) -> Any:
 def _guaranteed(posterior: Any, level: float, x: Tensor, num_samples: int) -> Any:
     """Return the guarantee, the ends of intervals, and the rule of the set."""
     pairs, stacks = posterior._held_out()
-    guarantee, rank = pairs.guarantee(level), rank_needed(level, len(pairs))
+    rank = pairs.rank(level)
+    guarantee = (
+        f"For observations drawn as the {len(pairs)} calibration pairs were, the truth "
+        f"is inside in about {level:.4g} of the cases, on average over observations "
+        "and calibration sets."
+    )
     draws = [_draw(one, pairs.num_draws, x) for one in stacks]
     of_folds = []
     for number, own in enumerate(draws):

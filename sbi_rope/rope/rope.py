@@ -347,11 +347,9 @@ class RoPE:
         )
         npe = self.npe
         warn_of_far_entries("x_o", x_o, npe.h)
-        # A copy, so that moving one posterior to a device leaves others where they are.
-        net = copy.deepcopy(self._net)
         coupling = coupler.couple(real, simulated)
         posterior = MixturePosterior(
-            Coupled(npe.density(), simulated, x_o, net, coupling),
+            Coupled(npe.density(), x_o, coupling),
             npe.prior,
             enable_transform=npe.enable_transform,
         )

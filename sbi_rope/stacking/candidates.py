@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope.data.pairs import without_warning_of_few_pairs
-from sbi_rope.density import Density, Flow, GaussianProcess, Given, Prior, density_of
+from sbi_rope.density import Density, Flow, GaussianProcess, Prior, density_of
 from sbi_rope.discrepancy.correction import (
     MOST_ENTRIES,
     SimulatedConstants,
@@ -64,8 +64,8 @@ class Candidate(ABC):
             versions: For each version, the rows of the pairs that it may see.
 
         Returns:
-            For each version a density, or anything else that :class:`GivenCandidate`
-            takes. One that sees no pairs may be that of all versions.
+            For each version a density, or an amortised posterior. One that sees no
+            pairs may be that of all versions.
         """
 
 
@@ -95,10 +95,8 @@ class GivenCandidate(Candidate):
     """A density that is there already, and has not seen the calibration pairs.
 
     Args:
-        density: An amortised posterior of NPE or of this package, a
-            :class:`~sbi_rope.density.Density`, or anything with its methods
-            ``log_prob(theta, x)``, shapes ``(S, B, d)`` and ``(B, *event)`` to
-            ``(S, B)``, and ``sample((n,), x)``, shape ``(n, B, d)``.
+        density: An amortised posterior of NPE or of this package, or a
+            :class:`~sbi_rope.density.Density`.
         name: Its name in the report; that of its class if None.
     """
 
@@ -114,8 +112,8 @@ class GivenCandidate(Candidate):
 
 
 def as_density(own: Any, data: StackData, name: str) -> Density:
-    """Return a posterior or anything else as a density, tried on two pairs."""
-    theta, x = data.pairs.mean[:2], data.pairs.x[:2]
+    """Return a posterior as a density of the shapes of the pairs."""
+    theta, x = data.pairs.mean, data.pairs.x
     if isinstance(own, NeuralPosterior):
         if not getattr(own, "is_amortised", True):
             raise UnsupportedPosteriorError(
@@ -124,7 +122,10 @@ def as_density(own: Any, data: StackData, name: str) -> Density:
             )
         own = density_of(own, what=f"the candidate {name!r}")
     if not isinstance(own, Density):
-        return Given(own, theta, x)
+        raise UnsupportedPosteriorError(
+            f"Expected the candidate {name!r} to be a posterior or a "
+            f"`sbi_rope.density.Density`; got {type(own).__name__}."
+        )
     shapes = own.condition_shape, own.input_shape
     if shapes != (x.shape[1:], theta.shape[1:]):
         raise UnsupportedPosteriorError(

@@ -368,7 +368,7 @@ def mixed_mixture(npe: Any, *, n_o: int = 20) -> tuple[MixturePosterior, Tensor]
     embeddings = embed(h, x_s)
     coupling = SinkhornCoupler(gamma=0.1, tau=0.9).couple(embed(h, x_o), embeddings)
     density = headless(copy.deepcopy(npe.posterior_estimator))
-    coupled = Coupled(density, embeddings, x_o, h, coupling)
+    coupled = Coupled(density, x_o, coupling)
     coupled.tail_mass = 0.0
     return MixturePosterior(coupled, copy.deepcopy(npe.prior)), x_s
 

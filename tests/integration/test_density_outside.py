@@ -15,7 +15,7 @@ from torch.distributions import Gamma, Independent
 from sbi_rope import RoPE
 from sbi_rope.baselines import FinetunedNPE
 from sbi_rope.rope.finetuning import FINETUNING
-from sbi_rope.stacking import StackedPosterior, default_candidates, stack
+from sbi_rope.stacking import default_candidates, stack
 from sbi_rope.utils.errors import RoPEWarning
 
 PRIOR = Independent(Gamma(1.5 * torch.ones(2), torch.ones(2)), 1)
@@ -47,25 +47,18 @@ def npe_posterior() -> Any:
     return posterior
 
 
-def measured(theta: Tensor) -> Tensor:
-    return simulator(theta) + 0.4
-
-
-def stacked(theta_cal: Tensor, x_cal: Tensor, *names: str) -> StackedPosterior:
-    rope = RoPE(npe_posterior(), simulator=simulator)
-    rope.append_calibration(theta_cal, x_cal)
-    kept = [c for c in default_candidates() if c.name in names]
-    return stack(rope, candidates=kept, num_folds=2, seed=0)
-
-
-def labels() -> Tensor:
+@functools.cache
+def pairs() -> tuple[Tensor, Tensor]:
     torch.manual_seed(1)
-    return PRIOR.sample((24,))
+    theta = PRIOR.sample((24,))
+    return theta, simulator(theta) + 0.4
 
 
 @pytest.mark.medium
 def test_the_density_outside_the_support_is_zero_without_a_warning() -> None:
-    posterior = stacked(labels(), measured(labels()), "prior", "NPE")
+    rope = RoPE(npe_posterior(), simulator=simulator).append_calibration(*pairs())
+    kept = [c for c in default_candidates() if c.name in ("prior", "NPE")]
+    posterior = stack(rope, candidates=kept, num_folds=2, seed=0)
     x, theta = torch.zeros(1, 2), torch.tensor([[-1.0, 1.0], [1.0, 1.0]])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -76,14 +69,13 @@ def test_the_density_outside_the_support_is_zero_without_a_warning() -> None:
 
 
 def test_a_label_on_a_bound_does_not_stop_fine_tuning() -> None:
-    theta, start = labels(), npe_posterior().posterior_estimator
-    x = measured(theta)
+    (theta, x), start = pairs(), npe_posterior().posterior_estimator
     on_bound = theta.clone()
     on_bound[0, 0] = 0.0
-    training = replace(FINETUNING, max_num_epochs=20)
+    training = replace(FINETUNING, max_num_epochs=60)
     method = FinetunedNPE.from_posterior(npe_posterior(), training=training)
     method.append_calibration(on_bound, x)
     with pytest.warns(RoPEWarning, match=r"1 calibration pair.* on a bound"):
-        method.train(show_progress_bars=False)
+        method.train(seed=1, show_progress_bars=False)
     tuned = method.build_posterior().posterior_estimator
     assert (start.loss(theta, x) - tuned.loss(theta, x)).mean() > 0.1

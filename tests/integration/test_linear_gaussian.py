@@ -21,7 +21,7 @@ def with_exact_g(x_o: Tensor, n_s: int, coupler: SinkhornCoupler) -> MixturePost
         simulated = h(gaussian.simulator(gaussian.prior().sample((n_s,))))
         coupling = coupler.couple(h(gaussian.undo(x_o)), simulated)
     density = headless(npe.posterior_estimator)
-    mixture = Coupled(density, simulated, x_o, h, coupling)
+    mixture = Coupled(density, x_o, coupling)
     mixture.tail_mass = 0.0
     return MixturePosterior(mixture, gaussian.prior())
 

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from torch.distributions import MultivariateNormal
 
 from sbi_rope import load
 from sbi_rope.density import Mixture, MixturePosterior, Prior
@@ -324,14 +325,11 @@ def test_without_a_seed_the_state_of_torch_decides() -> None:
     assert not torch.equal(found[0][0], found[2][0])
 
 
-class Wide:
+class Wide(Prior):
     """A density of a user: normal around zero, whatever x is."""
 
-    def log_prob(self, theta: Tensor, x: Tensor) -> Tensor:
-        return torch.distributions.Normal(0.0, 2.0).log_prob(theta).sum(dim=-1)
-
-    def sample(self, shape: torch.Size, x: Tensor) -> Tensor:
-        return 2.0 * torch.randn(*shape, len(x), 2)
+    def __init__(self) -> None:
+        super().__init__(MultivariateNormal(torch.zeros(2), 4 * torch.eye(2)), (3,))
 
 
 def test_densities_that_are_given_are_stacked_as_they_are() -> None:
@@ -349,7 +347,7 @@ def test_densities_that_are_given_are_stacked_as_they_are() -> None:
     another.posterior_estimator.eval()
     for name, expected in (
         ("older", unnormalised(another, theta, x)[0]),
-        ("Wide", Wide().log_prob(theta, x)),
+        ("Wide", Wide().log_prob(theta, x)[0]),
         ("StackedPosterior", unnormalised(small_stack(), theta, x)[0]),
     ):
         assert torch.allclose(scores_of(scores, name).float(), expected, atol=1e-4)
@@ -384,11 +382,6 @@ def test_too_few_pairs_are_refused() -> None:
         stacked(rope_of((theta[:1].expand(6, -1), x)))
 
 
-class Flat(Wide):
-    def log_prob(self, theta: Tensor, x: Tensor) -> Tensor:
-        return super().log_prob(theta, x).sum()
-
-
 def test_what_cannot_be_stacked_is_refused_before_anything_is_trained(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -398,7 +391,7 @@ def test_what_cannot_be_stacked_is_refused_before_anything_is_trained(
     other_theta = problems.npe_posterior("mdn", dim=1)
     bad: list[tuple[list[Any], type[Exception], str]] = [
         ([NPE, GivenCandidate(Wide(), "NPE")], InvalidInputError, "different names"),
-        ([Flat()], InvalidInputError, r"log_prob\(theta, x\) of shape \(1, 2\)"),
+        ([problems.box(2)], UnsupportedPosteriorError, "got BoxUniform"),
         ([without_density], UnsupportedPosteriorError, "'bad' with a density"),
         ([other_theta], UnsupportedPosteriorError, r"and theta \(1,\)"),
         ([for_a_batch], UnsupportedPosteriorError, "to answer any x"),

@@ -51,36 +51,31 @@ def test_rows_equal_those_of_the_oracle() -> None:
     real, simulated = clouds()
     cost = cost_of(real, simulated)
     for ratio, tau in ((1.0, 1.0), (0.1, 0.9), (1e-2, 0.5), (1e-3, 0.9)):
-        gamma = ratio * float(cost.max())
+        settings = {"gamma": ratio * float(cost.max()), "tau": tau}
         # It converges within 1500, or not at all in time.
-        oracle = {"gamma": gamma, "tau": tau, "iterations": 1500}
-        expected, change = oracles.semi_balanced_plan(cost, **oracle)
-        assert change < 1e-10
-        settings = {"gamma": gamma, "tau": tau, "max_iterations": 600}
+        expected, _ = oracles.semi_balanced_plan(cost, iterations=1500, **settings)
+        settings |= {"max_iterations": 600, "tolerance": 1e-10}
         for mode in MODES:
-            coupling = coupled(mode, real, simulated, tolerance=1e-10, **settings)
-            assert (coupling.weights.sum(dim=1) - 1).abs().max() < 1e-12
+            coupling = coupled(mode, real, simulated, **settings)
             assert coupling.converged, (mode, ratio, tau)
             distance = worst_total_variation(coupling.weights, expected)
             assert distance < 1e-6, (mode, ratio, tau)
 
 
 def test_the_plan_minimises_the_objective_of_the_paper() -> None:
-    real, simulated = clouds(8, 6)
+    real, simulated = clouds(20, 6)
     cost = cost_of(real, simulated)
-    coupler = raw_coupler(gamma=0.5, tau=0.7, tolerance=1e-12)
-    weights = coupler.couple(real, simulated).weights
-    best = oracles.objective(weights / 8, cost, gamma=0.5, tau=0.7)
+    weights = raw_coupler(tau=0.7, tolerance=1e-12).couple(real, simulated).weights
+    best = oracles.objective(weights / 20, cost, gamma=0.5, tau=0.7)
     for _ in range(50):
         other = weights * (1 + 0.01 * torch.randn_like(weights)).abs()
-        other /= 8 * other.sum(dim=1, keepdim=True)
+        other /= 20 * other.sum(dim=1, keepdim=True)
         assert oracles.objective(other, cost, gamma=0.5, tau=0.7) > best
 
 
 def test_the_marginal_error_measures_the_optimality_conditions() -> None:
     real, simulated = clouds(30, 40)
-    modes = itertools.product(MODES, ((1.0, 0.5), (0.9, 0.5), (0.5, 0.1)))
-    for mode, (tau, gamma) in modes:
+    for mode, (tau, gamma) in itertools.product(MODES, ((1.0, 0.5), (0.5, 0.1))):
         settings = {"gamma": gamma, "tau": tau, "tolerance": 1e-12}
         with pytest.warns(RoPEWarning, match="has not converged"):
             rough = coupled(mode, real, simulated, max_iterations=2, **settings)
@@ -90,11 +85,10 @@ def test_the_marginal_error_measures_the_optimality_conditions() -> None:
         assert fine.converged, mode
         # The errors are computed again from public fields alone.
         for coupling in (rough, fine):
-            q = coupling.weights.double().mean(dim=0)
-            target = torch.exp(-coupling.potential * (1 - tau) / tau) / q.numel()
-            expected = (q - target / target.sum()).abs().sum()
-            error = coupling.marginal_error
-            assert error == pytest.approx(float(expected), abs=1e-14)
+            q = coupling.weights.mean(dim=0)
+            target = torch.exp(-coupling.potential * (1 - tau) / tau)
+            expected = float((q - target / target.sum()).abs().sum())
+            assert coupling.marginal_error == pytest.approx(expected, abs=1e-14)
 
 
 def test_tau_zero_is_the_row_softmax_of_the_cost() -> None:
@@ -110,8 +104,7 @@ def test_gamma_is_in_units_of_the_median_distance_between_simulations() -> None:
     real, simulated = clouds(30, 40)
     simulated = simulated**3  # the mean distance is no longer near the median
     coupling = SinkhornCoupler(gamma=0.1).couple(real, simulated)
-    first, second = torch.triu_indices(40, 40, offset=1)
-    median = (simulated[first] - simulated[second]).norm(dim=1).median()
+    median = torch.nn.functional.pdist(simulated).median()
     assert coupling.gamma == pytest.approx(0.1 * float(median))
 
 
@@ -121,19 +114,11 @@ def test_rows_of_any_portion_are_the_weights_and_new_rows_are_near_a_refit() -> 
     coupling = coupler.couple(real, simulated)
     rows = torch.cat([coupling.rows(part) for part in real.split([1, 20, 179])])
     assert torch.allclose(rows, coupling.weights, atol=1e-13)
+    sizes = 1 / coupling.weights.square().sum(dim=1)
+    assert torch.allclose(coupling.effective_sample_size, sizes)
     new = torch.randn(1, 3, dtype=torch.float64)
     refit = coupler.couple(torch.cat([real, new]), simulated).weights[-1:]
     assert worst_total_variation(coupling.rows(new), refit) < 0.01
-
-
-def test_effective_sample_size_counts_equal_weights() -> None:
-    # The first observation is near two of four simulations, the second far from all.
-    simulated = torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 50.0], [0.0, -50.0]])
-    real = torch.tensor([[0.0, 0.0], [1e6, 0.0]])
-    coupling = raw_coupler(gamma=1.0, tau=0.0).couple(real, simulated)
-    sizes = coupling.effective_sample_size
-    assert sizes[0] == pytest.approx(2.0)
-    assert torch.allclose(sizes, 1 / coupling.weights.square().sum(dim=1))
 
 
 def test_columns_that_underflow_are_as_in_the_log_domain() -> None:
@@ -183,30 +168,18 @@ def test_it_converges_where_acceleration_alone_gets_lost(
     """
     coupler = SinkhornCoupler(gamma=0.05, max_iterations=1000)
 
-    def converged() -> list[bool]:
-        found = []
-        for seed in (1, 2):
-            torch.manual_seed(seed)
-            real, simulated = (
-                0.1 * torch.randn(n, 3) + 5.0 * torch.randint(0, 4, (n, 1))
-                for n in (150, 300)
-            )
-            found.append(coupler.couple(real, simulated).converged)
-        return found
+    def converged(seed: int) -> bool:
+        torch.manual_seed(seed)
+        real, simulated = (
+            0.1 * torch.randn(n, 3) + 5.0 * torch.randint(0, 4, (n, 1))
+            for n in (150, 300)
+        )
+        return coupler.couple(real, simulated).converged
 
-    assert all(converged())
+    assert all(map(converged, (1, 2)))
     monkeypatch.setattr(sinkhorn, "ENOUGH", -torch.inf)
     with pytest.warns(RoPEWarning, match="has not converged"):
-        assert not all(converged())
-
-
-def test_it_converges_with_far_points_on_both_sides() -> None:
-    real, simulated = clouds(150, 300)
-    real, simulated = real / torch.rand(150, 1), simulated / torch.rand(300, 1)
-    for tau in (0.9, 0.5, 0.1):
-        coupling = SinkhornCoupler(gamma=0.05, tau=tau).couple(real, simulated)
-        assert coupling.converged, tau
-        assert coupling.num_iterations < 300, tau  # plain steps need about 150
+        assert not all(map(converged, (1, 2)))
 
 
 @pytest.mark.gpu

@@ -39,9 +39,12 @@ def test_mean_and_spread_are_those_of_scikit_learn() -> None:
     reference.fit(((x - mean) / std).numpy(), ((theta - centre) / unit).numpy())
     new = pairs(7)[1]
     expected, spread = reference.predict(((new - mean) / std).numpy(), return_std=True)
-    z = found.embed(new)
+    z, far = found.embed(new), found.embed(new + 1e3)
     assert torch.allclose(z[:, :2], centre + unit * torch.as_tensor(expected))
     assert torch.allclose(z[:, 2], torch.as_tensor(spread[:, 0]), atol=1e-6)
+    # Far from all pairs it says that it does not know.
+    assert torch.allclose(far[:, :2], centre.expand(7, 2))
+    assert (far[:, 2] ** 2).tolist() == pytest.approx([variance + noise] * 7)
 
 
 def test_errors_are_those_of_predictions_without_the_group() -> None:
@@ -90,14 +93,6 @@ def test_ten_and_fifty_pairs_give_calibrated_predictions() -> None:
                 _, ranks = estimates_and_ranks(draws, theta[n:])
                 levels.append((2 * ranks - 1).abs())
             assert abs(float(torch.cat(levels).mean()) - 0.5) < 0.07, (n, width)
-
-
-def test_far_from_all_pairs_it_says_that_it_does_not_know() -> None:
-    theta, x = pairs(50)
-    found = process(theta, x)
-    near, far = found.embed(torch.stack([x[0], x[0] + 1e3]))
-    assert far[2] > 3 * near[2]
-    assert torch.allclose(far[:2], theta.double().mean(dim=0))
 
 
 def test_copies_of_a_pair_that_share_its_weight_are_one_pair() -> None:
