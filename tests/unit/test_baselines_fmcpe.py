@@ -10,7 +10,7 @@ from torch import nn
 from sbi_rope.baselines import FMCPE, Training
 from sbi_rope.baselines.flow_matching import Unbounded, VelocityField
 from tests import gaussian, problems
-from tests.baselines import log_prob, train
+from tests.baselines import log_prob, sample, train
 
 DIM = 2
 
@@ -88,7 +88,9 @@ def test_what_npe_has_outside_the_prior_is_replaced_by_the_prior() -> None:
 
 
 @pytest.mark.medium
-def test_labels_on_a_bound_are_like_labels_next_to_it() -> None:
+def test_in_a_box_its_mass_is_one_and_labels_on_a_bound_are_like_those_next_to_it() -> (
+    None
+):
     """Recorded settings are often exactly at the end of their range."""
     theta = problems.box(1).sample((40,))
     x = problems.simulate(torch.tensor([[-0.9]])) + 0.3
@@ -104,7 +106,14 @@ def test_labels_on_a_bound_are_like_labels_next_to_it() -> None:
             training=training,
         )
         method.append_calibration(theta, problems.simulate(theta) + 0.3)
-        densities.append(log_prob(train(method).build_posterior(), points[:, None], x))
+        posterior = train(method).build_posterior()
+        densities.append(log_prob(posterior, points[:, None], x))
+        # By the rectangle rule all mass is inside, and where the samples are.
+        grid = torch.linspace(-0.9995, 0.9995, 2000)[:, None, None]
+        mass = log_prob(posterior, grid, x).exp() * 0.001
+        assert float(mass.sum()) == pytest.approx(1, abs=0.05)
+        mean = float((mass[..., None] * grid).sum())
+        assert float(sample(posterior, 2000, x).mean()) == pytest.approx(mean, abs=0.1)
     torch.testing.assert_close(*densities, atol=0.3, rtol=0)
     # A density at the bound is like that next to it, and not 60 nats higher.
     assert float(densities[0][0]) == pytest.approx(float(densities[0][1]), abs=0.01)
