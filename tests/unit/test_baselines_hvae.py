@@ -98,9 +98,6 @@ def test_elbo_of_the_exact_posterior_is_the_evidence_for_every_draw() -> None:
     assert error.mean().abs() < 0.01
 
 
-# --- draws with a gradient ---
-
-
 @pytest.mark.parametrize("name", ["maf", "zuko_unaf"])
 def test_a_draw_moves_with_its_condition_so_that_its_noise_stays(name: str) -> None:
     theta = torch.randn(100, 2)
@@ -151,9 +148,6 @@ def test_physics_sees_parameters_inside_the_support_alone() -> None:
     assert torch.isfinite(model.elbo(EVIDENCE.sample((100,)))).all()
     assert torch.isfinite(prior.log_prob(seen[0])).all()
     assert (seen[0].abs() > 0.099).any()
-
-
-# --- the posterior ---
 
 
 def test_density_is_the_mean_over_all_draws_of_the_latent(
