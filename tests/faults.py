@@ -481,13 +481,13 @@ FAULTS = [
         "Spike and slab have exchanged their probabilities",
         "baselines.error_model:SpikeAndSlab.log_prob",
         argument(self=lambda m: replace(m, slab_probability=1 - m.slab_probability)),
-        "unit/test_baselines_error_model.py",
+        "unit/test_baselines_rnpe.py",
     ),
     Fault(
         "R-hat compares whole chains, which may all drift alike",
         "baselines.error_model:split_r_hat",
         argument(draws=lambda draws: draws.mean(dim=-2, keepdim=True) + 0 * draws),
-        "unit/test_baselines_error_model.py",
+        "unit/test_baselines_rnpe.py",
     ),
     Fault(
         "The discrepancy of NPE-RS is taken of distances that are not squared",

@@ -62,11 +62,10 @@ class DiagonalGaussian(ConditionalDensityEstimator):
 
     @torch.no_grad()
     def set_bounds(self, theta: Tensor, x: Tensor, draws: Tensor) -> None:
-        """Bound the mean by draws of the prior, and the deviation by the error.
+        """Bound the mean by draws of the prior, and the deviation by held-out errors.
 
-        Far from what it was trained on, a network can be sure of something wrong
-        without bound, and its mean can leave the prior's support, where no draw would
-        ever be accepted. The pairs are those of the hold-out set.
+        Far from what it was trained on, a network can be sure of something wrong, and
+        its mean can leave the prior's support, where no draw would ever be accepted.
         """
         error = (theta - self.law(x).mean) / self.std
         # As if two more pairs were off by a standard deviation of the prior: a few
@@ -140,8 +139,7 @@ class CalibrationMLP(Method):
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         theta, x = self._data.calibration
-        split = split_pairs(theta, self.training.validation_fraction)
-        train, held_out = split
+        train, held_out = split_pairs(theta, self.training.validation_fraction)
         seen = x[train].cpu()
         embedding = embedding_of(self._build(theta[train].cpu(), seen))
         leave_out_constants(embedding)
@@ -151,7 +149,7 @@ class CalibrationMLP(Method):
         history = fit_rows(
             estimator,
             lambda rows: estimator.loss(theta[rows], x[rows]).mean(),
-            split,
+            (train, held_out),
             self.training,
             pairs=theta,
             label="MLP",

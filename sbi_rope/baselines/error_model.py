@@ -81,13 +81,10 @@ def denoise(
     spike and slab are about equally wide. One chain starts at y, the others at the
     simulations to which the error model gives the largest density.
 
-    Standardised real statistics y are ``(n, l)``, simulated ones ``(n_s, l)``. Each
-    observation has ``num_draws`` draws from several chains, of which the first
-    ``warmup`` sweeps are thrown away and then all but every ``thin``-th.
-
-    Returns:
-        Draws of s, shape ``(n, num_draws, l)``, and the largest split-R-hat of the
-        statistics of each observation, shape ``(n,)``.
+    Standardised real statistics y are ``(n, l)``, simulated ones ``(n_s, l)``. The
+    first ``warmup`` sweeps of each chain are thrown away, then all but every
+    ``thin``-th. The draws are ``(n, num_draws, l)``, and the largest split-R-hats of
+    the statistics of each observation ``(n,)``.
     """
     rows = y.repeat_interleave(num_chains, dim=0).double()
 
@@ -113,8 +110,7 @@ def denoise(
     z = torch.as_tensor(sampler.run(math.ceil(num_draws / num_chains) * thin))
     z = z.to(rows).unflatten(0, (len(y), num_chains))
     noise = error_model.spike_std * torch.sinh(z)[:, :, thin - 1 :: thin]
-    # Alternating between the chains, so that dropping the last ones of an uneven
-    # number takes from all alike.
+    # In turns, so that dropping the last of an uneven number takes from all chains.
     s = (y[:, None, None] - noise).transpose(1, 2).flatten(1, 2)[:, :num_draws]
     return s.to(y), split_r_hat(z).amax(dim=-1).to(y)
 
@@ -140,12 +136,8 @@ def split_r_hat(draws: Tensor) -> Tensor:
         \hat R = \sqrt{\frac{n - 1}{n} + \frac{B}{n W}}
 
     with W the mean variance within half chains of n draws and B / n the variance of
-    their means. Draws are ``(..., num_chains, num_draws, l)``, and the result is
-    ``(..., l)``, infinite if no chain moves and they differ.
-
-    References:
-        | Bayesian Data Analysis (Gelman et al., 2013), section 11.4
-        | http://www.stat.columbia.edu/~gelman/book/
+    their means (Bayesian Data Analysis, Gelman et al., 2013, section 11.4). Draws are
+    ``(..., num_chains, num_draws, l)``, and the result is ``(..., l)``.
     """
     half = draws.shape[-2] // 2
     halves = torch.cat([draws[..., :half, :], draws[..., -half:, :]], dim=-3)

@@ -165,7 +165,6 @@ class FMCPE(Method):
         self, x: Tensor, unit: Standardise, h: nn.Module, *, size: int
     ) -> VelocityField:
         """Return an untrained velocity field of so many entries."""
-        condition: nn.Module
         if self.space == "embedding":
             condition = nn.Sequential(copy.deepcopy(h), nn.Flatten(), unit)
         elif x[0].numel() > MAX_SUMMARIES and any(True for _ in h.parameters()):

@@ -67,25 +67,18 @@ class HybridVAE(nn.Module):
         explained = self.physics_to_reality(self.physics(self.prior.nearest(theta)), z)
         return explained.log_prob(x_o) - kl - log_q + self.prior.log_prob(theta)
 
-    def calibration_log_prob(self, theta: Tensor, x: Tensor) -> Tensor:
-        """Return log q(theta | h(x_s)) with one draw of z each, ``(n,)``."""
-        _, _, s = self._infer(x)
-        return self.npe[1].log_prob(theta[None], s)[0]
-
     def objective(self, x_o: Tensor, theta: Tensor, x: Tensor) -> Tensor:
         """Return what is minimised: pairs weigh like all entries of an observation.
 
         Observations x_o are ``(n, *event)``; pairs, ``(m, d)`` and ``(m, *event)``.
         """
-        log_prob = self.calibration_log_prob(theta, x)
+        _, _, s = self._infer(x)
+        log_prob = self.npe[1].log_prob(theta[None], s)
         return -self.elbo(x_o).mean() - x_o[0].numel() * log_prob.mean()
 
 
 class LatentEncoder(nn.Module):
-    """A Gaussian over latent vectors, predicted by an embedding net that starts anew.
-
-    Some observations ``(n, *event)`` tell the width of an embedding.
-    """
+    """A Gaussian over latent vectors, given by an embedding net that starts anew."""
 
     def __init__(self, embedding: nn.Module, latent_dim: int, x: Tensor) -> None:
         super().__init__()
@@ -138,8 +131,8 @@ def reparametrised_sample(flow: Any, condition: Tensor) -> Tensor:
         \frac{\partial \theta}{\partial s} = -\left(
         \frac{\partial T}{\partial \theta} \right)^{-1} \frac{\partial T}{\partial s}.
 
-    Only :math:`T` is differentiated, so that flows may be inverted by a search. The
-    flow has no embedding net; conditions are ``(n, l)``, and parameters ``(n, d)``.
+    Only :math:`T` is differentiated, so that flows may be inverted by a search.
+    Conditions are ``(n, l)``, and parameters ``(n, d)``.
     """
     with torch.no_grad():
         theta = flow.sample(torch.Size((1,)), condition)[0]

@@ -15,11 +15,7 @@ HIDDEN = 64
 
 
 def fresh_copy(module: nn.Module) -> nn.Module:
-    """Copy a network and draw its parameters anew.
-
-    That is, those of all modules with a ``reset_parameters``, as torch's have. What
-    standardises keeps its constants.
-    """
+    """Copy a network and draw its parameters anew; standardisations stay."""
     module = copy.deepcopy(module).requires_grad_()
     # The outer ones last, whose own way to start overrules that of their parts.
     for part in reversed(list(module.modules())):
@@ -31,10 +27,9 @@ def fresh_copy(module: nn.Module) -> nn.Module:
 def embedding_with_head(
     embedding: nn.Module, num_outputs: int, x: Tensor
 ) -> nn.Sequential:
-    """Return a fresh embedding net followed by a linear layer.
+    """Return a fresh embedding net of observations x, followed by a linear layer.
 
     Where the embedding has no parameters, two hidden layers of 64 units stand between.
-    Its width is that of the embedding of x.
     """
     embedding = fresh_copy(embedding)
     width = embed(embedding, x[:1]).flatten(1).shape[1]
@@ -60,10 +55,9 @@ def fit_rows(
 ) -> History:
     """Train a network in place on the rows of a split.
 
-    The mean loss is that of some rows, given their numbers. ``validation_loss`` takes
-    the hold-out set, which may be empty, and is ``loss`` if None. Where too few pairs
-    of parameters ``pairs`` leave none to hold out, it warns and makes few epochs. Other
-    options are those of :func:`~sbi_rope.training.fit.fit`.
+    The mean loss is that of some rows, given their numbers; ``validation_loss`` is the
+    same if None. Where too few pairs of parameters ``pairs`` leave none to hold out, it
+    warns and makes few epochs. Other options are those of ``fit``.
     """
     rows, held_out = split
     score = validation_loss or loss

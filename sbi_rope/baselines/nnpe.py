@@ -72,7 +72,6 @@ class NNPE(Method):
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
         theta, x = self._data.simulations
         net, clip, density, estimator = clipped_statistics(npe, self.noise_on, x)
-
         error_model = self.error_model
 
         class Trainer(SimulationTrainer):

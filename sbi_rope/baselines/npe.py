@@ -85,13 +85,8 @@ class ReferenceNPE(PlainNPE):
     ) -> tuple[Tensor, Tensor]:
         """Return test parameters ``(n, d)``, each with one simulation.
 
-        Args:
-            theta: Test parameters.
-            simulator: Maps parameters to simulations, batched or not.
-            seed: Seed of the simulations; None uses the present random state.
-
-        Returns:
-            Parameters and simulations, without those that are not finite.
+        Simulations that are not finite are left out. The simulator may be batched or
+        not; with a seed of None it uses the present random state.
         """
         theta = self._read_theta(theta)
         like = theta.new_empty(0, *self._event_shape or ())

@@ -16,8 +16,7 @@ from sbi_rope.training.fit import History, Training
 from sbi_rope.utils.errors import warn_user
 from sbi_rope.utils.settings import NotNegative, check
 
-# Simulations, and observations, behind the discrepancy of each step, if there are so
-# many.
+# Simulations, and observations, behind the discrepancy of each step, at most.
 NUM_ROWS = 200
 
 
@@ -49,8 +48,8 @@ def squared_mmd(simulated: Tensor, observed: Tensor) -> Tensor:
     def mean_kernel(squared_distances: Tensor) -> Tensor:
         return torch.exp(-squared_distances / scale).mean()
 
-    within = mean_kernel(within_simulated)
-    within = within + mean_kernel(_squared_distances(observed, observed))
+    within_observed = _squared_distances(observed, observed)
+    within = mean_kernel(within_simulated) + mean_kernel(within_observed)
     return within - 2 * mean_kernel(across)
 
 
@@ -136,14 +135,12 @@ class NPERS(Method):
         if not self.regularisation or not _has_trainable_embedding(estimator):
             return 0.0
         embedding = embedding_of(estimator)
-        simulations, observations = (
-            rows[torch.randperm(len(rows))[:NUM_ROWS]]
-            for rows in (x, self._data.observations)
-        )
         # Batch normalisation would centre each of the two sets, and dropout is noise.
         embedding.eval()
-        simulated = embedding(simulations).flatten(1)
-        observed = embedding(observations).flatten(1)
+        simulated, observed = (
+            embedding(rows[torch.randperm(len(rows))[:NUM_ROWS]]).flatten(1)
+            for rows in (x, self._data.observations)
+        )
         embedding.train()
         return self.regularisation * squared_mmd(simulated, observed)
 

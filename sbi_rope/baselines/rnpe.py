@@ -11,7 +11,7 @@ from sbi_rope.baselines.statistics import (
     OverDraws,
     fit_with_jitter,
     split_at_statistics,
-    standardisation_of_statistics,
+    statistics_of,
 )
 from sbi_rope.methods.base import Method
 from sbi_rope.methods.training import EstimatorBuilder
@@ -19,7 +19,6 @@ from sbi_rope.npe.sbi import (
     ConditionalDensityEstimator,
     build_zuko_unconditional_flow,
     direct_posterior,
-    embed,
     estimator_of,
 )
 from sbi_rope.npe.standardisation import Standardisation
@@ -36,7 +35,7 @@ NUM_STARTS = 5000
 # Hidden units and transforms of the marginal density. A single spline transform is
 # evaluated in half the time of two, and the denoising does little else.
 HIDDEN, NUM_TRANSFORMS = 64, 1
-# Of the networks' outputs at the start.
+# Of the outputs of its networks at the start.
 SHRINKAGE = 0.01
 
 
@@ -72,26 +71,20 @@ class Denoised(OverDraws):
         self.error_model = error_model
         self.chains = chains
         self.seed = seed
-        self._denoised: dict[bytes, tuple[Tensor, Tensor]] = {}
+        self._denoised: dict[bytes, Tensor] = {}
 
     def embed(self, x: Tensor) -> Tensor:
         """Return the draws of s of each observation, ``(n, num_denoised, l)``."""
-        return torch.stack([draws for draws, _ in self._lookup(x)]).to(self.starts)
-
-    def r_hat(self, x: Tensor) -> Tensor:
-        """Return the largest split-R-hat of each observation's chains, ``(n,)``."""
-        return torch.stack([r_hat for _, r_hat in self._lookup(x)]).to(self.starts)
-
-    def _lookup(self, x: Tensor) -> list[tuple[Tensor, Tensor]]:
         x = as_batch("x", x, self.condition_shape).to(self.starts)
         keys = [row.tobytes() for row in (x.detach().cpu() + 0.0).numpy()]
         # Equal observations are denoised once.
         new = {key: i for i, key in enumerate(keys) if key not in self._denoised}
         if new:
-            self._denoise(list(new), x[list(new.values())])
-        return [self._denoised[key] for key in keys]
+            draws = self._denoise(x[list(new.values())])
+            self._denoised |= zip(new, draws, strict=True)
+        return torch.stack([self._denoised[key] for key in keys]).to(self.starts)
 
-    def _denoise(self, keys: list[bytes], x: Tensor) -> None:
+    def _denoise(self, x: Tensor) -> Tensor:
         y = self.standardisation(super().embed(x)[:, 0]).clamp(-BOUND, BOUND)
         with seeded(self.seed):
             draws, r_hats = denoise(
@@ -108,8 +101,7 @@ class Denoised(OverDraws):
                 f"{MAX_R_HAT}); their posteriors depend on chance. Raise `warmup` and "
                 "`thin`, or use fewer statistics."
             )
-        draws = self.standardisation.undo(draws).cpu()
-        self._denoised |= zip(keys, zip(draws, r_hats.cpu(), strict=True), strict=True)
+        return self.standardisation.undo(draws).cpu()
 
 
 class RNPE(Method):
@@ -122,8 +114,7 @@ class RNPE(Method):
 
     in units of each statistic's standard deviation over the simulations. The density
     q(s) is a neural spline flow. For every observation, statistics are drawn by sbi's
-    slice sampler and kept with the posterior. Chains that disagree are warned of, and
-    ``posterior.posterior_estimator.r_hat(x)`` tells by how much.
+    slice sampler and kept with the posterior. Chains that disagree are warned of.
 
     It sees simulations. It assumes that statistics err independently of each other, any
     of them. A sweep moves one statistic at a time, so that chains are slow on strongly
@@ -185,10 +176,9 @@ class RNPE(Method):
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
         net, density = split_at_statistics(estimator_of(npe), self.noise_on)
         _, x = self._data.simulations
-        statistics = embed(net, x)
-        s = standardisation_of_statistics(statistics)(statistics)
+        statistics = statistics_of(net, x)
         marginal, history = fit_marginal(
-            s,
+            Standardisation(statistics)(statistics),
             jitter=self.error_model.spike_std,
             training=self.training,
             show_progress_bars=show_progress_bars,
@@ -226,8 +216,5 @@ def fit_marginal(s: Tensor, *, training: Training, **options: Any) -> Any:
         if is_network or isinstance(module, nn.ParameterList):
             for parameter in (module[-1] if is_network else module).parameters():
                 parameter.data.mul_(SHRINKAGE)
-    flow = flow.to(s.device)
-    label = "Density of the statistics"
-    return flow, fit_with_jitter(
-        flow, s, None, training=training, label=label, **options
-    )
+    flow, label = flow.to(s.device), "Density of the statistics"
+    return flow, fit_with_jitter(flow, s, training=training, label=label, **options)

@@ -18,30 +18,25 @@ from sbi_rope.baselines.statistics import (
     NoiseOn,
     clipped_statistics,
     fit_with_jitter,
-    standardisation_of_statistics,
+    statistics_of,
 )
 from sbi_rope.data.pairs import split_pairs
 from sbi_rope.methods.base import Method
 from sbi_rope.methods.training import EstimatorBuilder
-from sbi_rope.npe.sbi import embed, posterior_from
+from sbi_rope.npe.sbi import posterior_from
 from sbi_rope.npe.standardisation import Standardisation
 from sbi_rope.training.fit import History, Training
 from sbi_rope.utils.seeds import seeded
 from sbi_rope.utils.settings import check
-from sbi_rope.utils.tensors import as_batch
 
 # K, the share of the draws that come from the prior, and lambda.
 NUM_DRAWS, SHARE_OF_PRIOR, SHRINKAGE = 32, 0.25, 0.1
 # What sbi adds to the precision of each Gaussian that it mixes.
 SMALLEST_PRECISION = 1e-4
-# Units of each of the two hidden layers, as in the original code.
-HIDDEN = 128
-# Gaussians that the density of simulated statistics mixes.
-NUM_COMPONENTS = 5
-# Standard deviation of the errors before training.
-START = 0.5
-# Noise on simulated statistics, and the smallest standard deviation of an error.
-JITTER, SMALLEST = 0.01, 1e-3
+# Units of each hidden layer, and Gaussians that the density of statistics mixes.
+HIDDEN, NUM_COMPONENTS = 128, 5
+# Standard deviations: of errors before training and at least, and of noise on s.
+START, SMALLEST, JITTER = 0.5, 1e-3, 0.01
 
 
 class RVNP(Method):
@@ -128,9 +123,9 @@ class RVNP(Method):
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
         theta, x = self._data.simulations
         net, _, density, estimator = clipped_statistics(npe, self.noise_on, x)
-        simulated, observed = embed(net, x), embed(net, self._data.observations)
-        standardise = standardisation_of_statistics(simulated)
-        observed = as_batch("statistics of x_o", observed)
+        simulated = statistics_of(net, x)
+        observed = statistics_of(net, self._data.observations)
+        standardise = Standardisation(simulated)
         s, y = standardise(simulated), standardise(observed)
         surrogate = fit_surrogate(
             theta,
@@ -218,11 +213,8 @@ class Bound(nn.Module):
         log_v = log_lik.unflatten(0, theta.shape[:2]) + log_prior - log_r
         weights = log_v.detach().softmax(dim=0)
         cross_entropy = -(weights * log_q).sum(dim=0)
-        return (
-            log_v.logsumexp(dim=0),
-            cross_entropy,
-            of_mean.square().sum(dim=1).mean(),
-        )
+        squared_shift = of_mean.square().sum(dim=1).mean()
+        return log_v.logsumexp(dim=0), cross_entropy, squared_shift
 
 
 class ErrorModel(nn.Module):
@@ -248,10 +240,9 @@ class ErrorModel(nn.Module):
             unit, last = Standardisation(theta), nn.Linear(HIDDEN, 2 * size)
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
-            num_varying = int(unit.varies.sum())
             self.net = nn.Sequential(
                 unit,
-                nn.Linear(num_varying, HIDDEN),
+                nn.Linear(int(unit.varies.sum()), HIDDEN),
                 nn.Tanh(),
                 nn.Linear(HIDDEN, HIDDEN),
                 nn.Tanh(),
@@ -264,9 +255,8 @@ class ErrorModel(nn.Module):
 
         At parameters ``(n, d)`` these are ``(n, l)``, ``(n, l)`` and ``(n, l, l)``.
         """
-        changes = theta.new_zeros(len(theta), 2 * self.size)
-        if self.net is not None:
-            changes = self.net(theta)
+        none = theta.new_zeros(len(theta), 2 * self.size)
+        changes = none if self.net is None else self.net(theta)
         of_mean, of_scale = changes.chunk(2, dim=1)
         of_mean = of_mean if self.shift else torch.zeros_like(of_mean)
         scale = F.softplus(self.scale + of_scale) + SMALLEST
@@ -298,9 +288,8 @@ def log_likelihood(
     r"""Return the log density of real statistics given parameters.
 
     .. math::
-        p(y \mid \theta) = \int p(s \mid \theta)\, p(y \mid s, \theta)\, ds
-        = \sum_c \pi_c\, \mathcal{N}\bigl(y;\, m_c + \mu + \mu(\theta),\,
-        S_c + L(\theta) L(\theta)^\top\bigr)
+        p(y \mid \theta) = \sum_c \pi_c\, \mathcal{N}\bigl(y;\,
+        m_c + \mu + \mu(\theta),\, S_c + L(\theta) L(\theta)^\top\bigr)
 
     with :math:`\pi_c, m_c, S_c` the weights, means and covariances of the surrogate.
     The standardised y is ``(n, l)``, and theta ``(n, d)``. The log densities are
@@ -321,11 +310,10 @@ def log_likelihood(
 
 
 def gaussians_of(network: Any, condition: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the Gaussians that a mixture density network of sbi mixes.
+    """Return the Gaussians that sbi's mixture density network mixes, in float64.
 
-    Given conditions ``(n, k)``, these are the logarithms of their weights up to a
-    constant, ``(n, c)``, their means, ``(n, c, l)``, and covariances, ``(n, c, l, l)``,
-    all in float64. The network was built with ``z_score_x="none"``.
+    Given conditions ``(n, k)``, these are log weights up to a constant, ``(n, c)``,
+    means, ``(n, c, l)``, and covariances. The network does not standardise.
     """
     mixture = network.get_uncorrected_mog(condition)
     # In float32 a narrow covariance would not be positive definite after rounding.

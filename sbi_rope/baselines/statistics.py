@@ -18,7 +18,6 @@ from sbi_rope.npe.sbi import (
     headless,
     with_embedding,
 )
-from sbi_rope.npe.standardisation import Standardisation
 from sbi_rope.training.ensemble import Ensemble, embedded, log_density
 from sbi_rope.training.fit import History, Training
 from sbi_rope.utils.tensors import as_batch
@@ -44,9 +43,8 @@ def split_at_statistics(
 def frozen_statistics(npe: Any) -> tuple[nn.Module, ConditionalDensityEstimator]:
     r"""Return h and :math:`q(\theta \mid h(x))` of NPE, as frozen copies."""
     estimator = copy.deepcopy(estimator_of(npe)).eval()
-    return split_at_statistics(
-        estimator.requires_grad_(requires_grad=False), "embedding"
-    )
+    estimator.requires_grad_(requires_grad=False)
+    return split_at_statistics(estimator, "embedding")
 
 
 class OverDraws(Flow):
@@ -76,11 +74,10 @@ class OverDraws(Flow):
     readable = Density.readable  # what is finite
 
 
-def standardisation_of_statistics(statistics: Tensor) -> Standardisation:
-    """Return the map from vectors ``(n, l)`` to standard deviations of these."""
-    return Standardisation(
-        as_batch("statistics of x", statistics, statistics.shape[-1:])
-    )
+def statistics_of(net: nn.Module, x: Tensor) -> Tensor:
+    """Return the statistics of observations, which must be vectors ``(n, l)``."""
+    s = embed(net, x)
+    return as_batch("statistics of x", s, s.shape[-1:])
 
 
 class SoftClip(nn.Module):
@@ -91,9 +88,8 @@ class SoftClip(nn.Module):
         \operatorname{sign}(z)\, c\, (1 + \log (|z| / c)) & |z| > c \end{cases}
 
     with z a statistic in standard deviations from its mean over simulations and c = 3.
-    It changes nothing where simulations are, but keeps networks from inputs that are
-    hundreds of times larger. Statistics that are the same in all simulations stay at
-    that value.
+    It keeps networks from inputs that are hundreds of times larger than simulations.
+    Statistics that are the same in all simulations stay at that value.
     """
 
     mean: Tensor
@@ -117,12 +113,10 @@ class SoftClip(nn.Module):
 def clipped_statistics(
     npe: Any, noise_on: NoiseOn, x: Tensor
 ) -> tuple[nn.Module, SoftClip, Any, Any]:
-    r"""Return what a copy of NPE that clips its statistics s is made of.
+    r"""Return the parts of a copy of NPE that clips its statistics s.
 
-    Returns:
-        The map from x to s; their clip by simulations x; :math:`q(\theta \mid s)` and
-        :math:`q(\theta \mid x)`, which clip s, share their parameters, and are the same
-        if s is x.
+    That is, the map from x to s; their clip by simulations x; :math:`q(\theta \mid s)`
+    and :math:`q(\theta \mid x)`, which share their parameters.
     """
     estimator = copy.deepcopy(estimator_of(npe)).requires_grad_()
     net, density = split_at_statistics(estimator, noise_on)
@@ -136,7 +130,7 @@ def clipped_statistics(
 def fit_with_jitter(
     density: Any,
     s: Tensor,
-    theta: Tensor | None,
+    theta: Tensor | None = None,
     *,
     jitter: float,
     training: Training,
@@ -144,9 +138,8 @@ def fit_with_jitter(
 ) -> History:
     r"""Train a density of statistics, given theta if there is one.
 
-    Gaussian noise on them is drawn anew for every batch; ``jitter`` is its standard
-    deviation. Without noise, statistics that depend on each other have no density.
-    Other options are those of :func:`~sbi_rope.training.fit.fit`.
+    Gaussian noise of standard deviation ``jitter`` is drawn anew for every batch:
+    without it, statistics that depend on each other have no density.
     """
 
     def loss(rows: Tensor) -> Tensor:

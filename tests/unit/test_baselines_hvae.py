@@ -1,28 +1,26 @@
 """The HVAE: bound, gradients, networks, mixture and training."""
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
 import torch
-from sbi.inference import NPE
 from sbi.neural_nets import posterior_nn
 from sbi.utils import BoxUniform
 from torch import Tensor, nn
 from torch.distributions import Independent, MultivariateNormal, Normal
 
-from sbi_rope.baselines.hvae import HVAE, OverLatents
+from sbi_rope.baselines import HVAE, PlainNPE, Training
+from sbi_rope.baselines.hvae import OverLatents
 from sbi_rope.baselines.hvae_model import (
     ConditionalUNet,
     ContinuedPrior,
     HybridVAE,
     reparametrised_sample,
 )
-from sbi_rope.methods import Training
 from sbi_rope.npe.sbi import headless
-from sbi_rope.tasks.pendulum import PendulumSimulator
-from tests.baselines import swing
+from sbi_rope.tasks import get_task
+from tests.baselines import log_prob, swing, train
 
 # --- a linear-Gaussian model whose evidence is known ---
 # theta ~ N(0, I_2), z ~ N(0, 1), x = A theta + B z + noise of standard deviation 0.5.
@@ -59,17 +57,11 @@ class LinearFlow(nn.Module):
 
 
 class Encoder(nn.Module):
-    """The exact q(z | x), moved by ``shift`` standard deviations."""
-
-    def __init__(self, shift: float = 0.0) -> None:
-        super().__init__()
-        gain = torch.linalg.solve(COVARIANCE, B)
-        self.variance = 1 - (B.T @ gain).squeeze()
-        self.gain, self.shift = gain, shift
+    """The exact q(z | x)."""
 
     def forward(self, x: Tensor) -> Independent:
-        std = self.variance.sqrt()
-        return Independent(Normal(x @ self.gain + self.shift * std, std), 1)
+        gain = torch.linalg.solve(COVARIANCE, B)
+        return Independent(Normal(x @ gain, (1 - (B.T @ gain).squeeze()).sqrt()), 1)
 
 
 class Shift(nn.Module):
@@ -84,9 +76,9 @@ class Shift(nn.Module):
         return Independent(Normal(mean, self.std), 1)
 
 
-def linear_model(shift: float = 0.0) -> HybridVAE:
+def linear_model() -> HybridVAE:
     return HybridVAE(
-        Encoder(shift),
+        Encoder(),
         Shift(-1.0, 1.0),
         Shift(1.0, NOISE_STD),
         npe=(nn.Identity(), LinearFlow()),
@@ -96,7 +88,6 @@ def linear_model(shift: float = 0.0) -> HybridVAE:
 
 
 def test_elbo_of_the_exact_posterior_is_the_evidence_for_every_draw() -> None:
-    torch.manual_seed(0)
     x = EVIDENCE.sample((200,))
     # The KL term is in closed form, so that single draws scatter about it.
     model = linear_model()
@@ -107,70 +98,20 @@ def test_elbo_of_the_exact_posterior_is_the_evidence_for_every_draw() -> None:
     assert error.mean().abs() < 0.01
 
 
-def test_elbo_of_a_shifted_encoder_is_lower_by_the_divergence() -> None:
-    torch.manual_seed(0)
-    x = EVIDENCE.sample((20_000,))
-    gap = (EVIDENCE.log_prob(x) - linear_model(shift=1.5).elbo(x)).detach()
-    # KL of two Gaussians of the same variance, 1.5 standard deviations apart. But theta
-    # is then inferred at the wrong z, exactly, which costs nothing more.
-    standard_error = float(gap.std()) / math.sqrt(len(gap))
-    assert standard_error < 0.03
-    assert float(gap.mean()) == pytest.approx(1.5**2 / 2, abs=4 * standard_error)
-
-
-# --- draws with a gradient ---
-
-
-@pytest.fixture
-def double() -> Iterator[None]:
-    """Make float64 the default, which nflows asks for where it makes tensors."""
-    torch.set_default_dtype(torch.float64)
-    yield
-    torch.set_default_dtype(torch.float32)
-
-
-def flow(name: str) -> Any:
-    torch.manual_seed(0)
+@pytest.mark.parametrize("name", ["maf", "zuko_unaf"])
+def test_a_draw_moves_with_its_condition_so_that_its_noise_stays(name: str) -> None:
     theta = torch.randn(100, 2)
     x = torch.cat([theta, theta.sin()], dim=1) + 0.3 * torch.randn(100, 4)
-    options = {} if name in ("mdn", "made") else {"num_transforms": 2}
-    return headless(posterior_nn(name, **options)(theta, x).eval())
+    flow: Any = headless(posterior_nn(name, num_transforms=2)(theta, x).eval())
+    s, weights = torch.randn(10, 4, requires_grad=True), torch.randn(10, 2)
 
+    def gradient_of_noise(theta: Tensor) -> Tensor:
+        noise = flow.inverse_transform(theta, s)
+        return torch.autograd.grad((weights * noise).sum(), s)[0]
 
-@pytest.mark.medium
-@pytest.mark.usefixtures("double")
-@pytest.mark.parametrize("name", ["maf", "zuko_unaf"])
-def test_gradient_of_a_draw_is_that_of_finite_differences_at_fixed_noise(
-    name: str,
-) -> None:
-    q = flow(name)
-    s = torch.randn(10, 4).requires_grad_()
-    theta = reparametrised_sample(q, s)
-    direction, weights = torch.randn(10, 4), torch.randn(10, 2)
-    (gradient,) = torch.autograd.grad((theta * weights).sum(), s)
-    noise = q.inverse_transform(theta, s).detach()
-
-    def at_same_noise(s: Tensor) -> Tensor:
-        # By Newton's method, as some flows are inverted too coarsely for differences.
-        point = theta.detach()
-        for _ in range(10):
-            point = point.clone().requires_grad_()
-            u = q.inverse_transform(point, s)
-            rows = [
-                torch.autograd.grad(u[:, k].sum(), point, retain_graph=True)[0]
-                for k in range(2)
-            ]
-            step = torch.linalg.solve(torch.stack(rows, 1), (u - noise)[..., None])
-            point = (point - step[..., 0]).detach()
-        return point
-
-    s = s.detach()
-    h = 1e-5
-    difference = at_same_noise(s + h * direction) - at_same_noise(s - h * direction)
-    expected = (difference / (2 * h) * weights).sum(dim=1)
-    torch.testing.assert_close(
-        (gradient * direction).sum(dim=1), expected, atol=1e-5, rtol=1e-4
-    )
+    theta = reparametrised_sample(flow, s)
+    assert gradient_of_noise(theta.detach()).abs().mean() > 0.01
+    assert gradient_of_noise(theta).abs().max() < 1e-4
 
 
 # --- the prior, continued ---
@@ -209,20 +150,12 @@ def test_physics_sees_parameters_inside_the_support_alone() -> None:
     assert (seen[0].abs() > 0.099).any()
 
 
-# --- the posterior ---
-
-
-def mixture() -> OverLatents:
-    torch.manual_seed(0)
-    return OverLatents(linear_model(shift=1.0), torch.randn(7, 1), torch.Size((4,)))
-
-
 def test_density_is_the_mean_over_all_draws_of_the_latent(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    estimator = mixture()
+    estimator = OverLatents(linear_model(), torch.randn(7, 1), torch.Size((4,)))
     x, theta = EVIDENCE.sample((3,)), torch.randn(5, 3, 2)
-    law = Encoder(1.0)(x)
+    law = Encoder()(x)
     expected = torch.zeros(5, 3)
     for epsilon in estimator.noise:
         z = law.mean + law.stddev * epsilon
@@ -239,7 +172,6 @@ def test_density_is_the_mean_over_all_draws_of_the_latent(
 def test_several_latents_of_one_x_are_the_same_as_one_at_a_time(
     event: tuple[int, ...],
 ) -> None:
-    torch.manual_seed(0)
     net = ConditionalUNet(torch.randn(100, *event), 5, width=4)
     for parameter in net.parameters():
         if not parameter.any():  # as after a training; few ReLUs are shut
@@ -269,51 +201,34 @@ def test_the_net_starts_as_the_identity_at_the_variance_of_the_data() -> None:
 
 # --- the method ---
 
-PRIOR = BoxUniform(torch.tensor([0.0, 0.5]), torch.tensor([3.0, 10.0]))
-
-
-def real(n: int) -> tuple[Tensor, Tensor]:
-    theta = PRIOR.sample((n,))
-    return theta, PendulumSimulator(max_damping=1.0)(theta)
-
-
-def scores(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
-    return posterior.log_prob_batched(theta[None], x=x, norm_posterior=False)[0]
-
 
 @pytest.mark.slow
-def test_training_improves_on_npe_for_held_out_real_data_and_leaves_npe_alone() -> None:
+def test_training_improves_on_npe_for_held_out_real_data() -> None:
     torch.manual_seed(0)
-    theta = PRIOR.sample((2000,))
+    task = get_task("pendulum")
     net = nn.Sequential(nn.Linear(200, 32), nn.ReLU(), nn.Linear(32, 32), nn.ReLU())
     builder = posterior_nn(
         "maf", embedding_net=net, z_score_x="structured", num_transforms=2
     )
-    trainer = NPE(PRIOR, density_estimator=builder, show_progress_bars=False)
-    trainer.append_simulations(theta, PendulumSimulator()(theta))
-    trainer.train(max_num_epochs=10, training_batch_size=100, learning_rate=2e-3)
-    npe = trainer.build_posterior()
     training = Training(
         training_batch_size=50,
         learning_rate=3e-3,
         validation_fraction=0.2,
-        max_num_epochs=10,
+        max_num_epochs=15,
     )
-    method = HVAE.from_posterior(npe, physics=swing, width=2, training=training)
-    method.append_calibration(*real(200)).append_observations(real(60)[1])
-    posterior = method.train(seed=0, show_progress_bars=False).build_posterior()
-    theta, x = real(300)
-    gain = scores(posterior, theta, x) - scores(npe, theta, x)
-    standard_error = float(gain.std()) / math.sqrt(len(gain))
-    assert float(gain.mean()) > 3 * standard_error
+    of_npe = Training(training_batch_size=100, learning_rate=2e-3, max_num_epochs=5)
+    npe = PlainNPE(task.get_prior(), builder, npe_training=of_npe)
+    npe = train(npe.append_simulations(*task.get_simulations(1000))).build_posterior()
+    method = HVAE.from_posterior(npe, physics=swing, width=4, training=training)
+    method.append_calibration(*task.get_calibration_set(200))
+    method.append_observations(task.get_test_set(360)[1][300:])
+    posterior = train(method).build_posterior()
+    theta, x = (rows[:300] for rows in task.get_test_set(360))
+    gain = log_prob(posterior, theta[None], x) - log_prob(npe, theta[None], x)
+    assert float(gain.mean()) > 3 * float(gain.std()) / math.sqrt(300)
     history = method.history
     assert history.kept_validation_loss < history.validation_loss[0]
     estimator = posterior.posterior_estimator
     inside = headless(npe.posterior_estimator).state_dict()
     for name, value in estimator.densities.member(0).state_dict().items():
         assert torch.equal(value, inside[name])
-    net = npe.posterior_estimator.embedding_net
-    for own, given in zip(
-        estimator.nets.member(0).parameters(), net.parameters(), strict=True
-    ):
-        assert torch.equal(own, given)

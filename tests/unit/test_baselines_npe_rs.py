@@ -12,6 +12,7 @@ from sbi_rope.baselines import NPERS, PlainNPE, Training
 from sbi_rope.baselines.npe_rs import squared_mmd
 from sbi_rope.npe.sbi import embed, embedding_of
 from sbi_rope.utils.errors import RoPEWarning
+from tests.baselines import log_prob, train
 from tests.problems import standard_normal
 
 pytestmark = pytest.mark.filterwarnings("ignore:Maximum number of epochs")
@@ -25,31 +26,21 @@ NOISE_STD = 0.5
 SHIFT = 3.0
 
 
-def brute_force(simulated: Tensor, observed: Tensor) -> float:
-    """The double sums, one pair at a time."""
-
-    def squared_distance(a: Tensor, b: Tensor) -> float:
-        return sum(float(u - v) ** 2 for u, v in zip(a, b, strict=True))
-
-    distances = sorted(squared_distance(a, b) for a in simulated for b in simulated)
-    median = distances[(len(distances) - 1) // 2]
-
-    def mean(xs: Tensor, ys: Tensor) -> float:
-        values = [math.exp(-squared_distance(x, y) / median) for x in xs for y in ys]
-        return sum(values) / len(values)
-
-    within = mean(simulated, simulated) + mean(observed, observed)
-    return within - 2 * mean(simulated, observed)
-
-
 @pytest.mark.parametrize(("m", "n"), [(7, 5), (6, 6), (8, 1)])
 def test_the_discrepancy_and_its_gradient_are_those_of_the_double_sum(
     m: int, n: int
 ) -> None:
     """The bandwidth included, which depends on the simulations."""
-    simulated = torch.randn(m, 3, dtype=torch.float64)
-    observed = 0.5 + 1.5 * torch.randn(n, 3, dtype=torch.float64)
-    expected = brute_force(simulated, observed)
+    simulated, observed = torch.randn(m, 3).double(), 0.5 + torch.randn(n, 3).double()
+    squares = [float(((a - b) ** 2).sum()) for a in simulated for b in simulated]
+    median = sorted(squares)[(m * m - 1) // 2]
+
+    def mean(xs: Tensor, ys: Tensor) -> float:
+        squares = [float(((x - y) ** 2).sum()) for x in xs for y in ys]
+        return sum(math.exp(-one / median) for one in squares) / len(squares)
+
+    within = mean(simulated, simulated) + mean(observed, observed)
+    expected = within - 2 * mean(simulated, observed)
     assert float(squared_mmd(simulated, observed)) == pytest.approx(expected)
     both = simulated.requires_grad_(), observed.requires_grad_()
     assert torch.autograd.gradcheck(squared_mmd, both)
@@ -102,15 +93,7 @@ def trained(
     method = kind(prior, density, **options).append_simulations(theta, x)
     if not of_npe:
         method.append_observations(x_o)
-    return method.train(seed=0, show_progress_bars=False).build_posterior()
-
-
-def densities(posterior: Any) -> Tensor:
-    torch.manual_seed(2)
-    theta = standard_normal(1).sample((50,))
-    return posterior.log_prob_batched(
-        theta[None], simulate(theta), norm_posterior=False
-    )
+    return train(method).build_posterior()
 
 
 def scores(posterior: Any, shift: float) -> tuple[float, float, float]:
@@ -122,7 +105,6 @@ def scores(posterior: Any, shift: float) -> tuple[float, float, float]:
     torch.manual_seed(3)
     theta = standard_normal(1).sample((2000,))
     x, x_o = simulate(theta), simulate(theta, shift)
-    log_prob = posterior.log_prob_batched(theta[None], x_o, norm_posterior=False)
     variance = 1 / (1 + 2 / NOISE_STD**2)
     undone = x_o - torch.tensor([0.0, shift])
     mean = undone.sum(dim=1, keepdim=True) * variance / NOISE_STD**2
@@ -130,7 +112,8 @@ def scores(posterior: Any, shift: float) -> tuple[float, float, float]:
     embedding = embedding_of(posterior.posterior_estimator)
     real, simulated = embed(embedding, x_o), embed(embedding, x)
     gap = (real.mean(0) - simulated.mean(0)).abs() / simulated.std(0)
-    return float(log_prob.mean()), float(exact.mean()), float(gap.max())
+    found = log_prob(posterior, theta[None], x_o)
+    return float(found.mean()), float(exact.mean()), float(gap.max())
 
 
 @pytest.mark.slow
@@ -152,13 +135,16 @@ def test_embeddings_meet_where_a_statistic_is_wrong_and_npe_stays_where_not(
 
 
 def test_without_regularisation_or_a_net_to_regularise_it_is_npe() -> None:
-    expected = densities(trained(kind=PlainNPE))
-    assert torch.equal(densities(trained(regularisation=0)), expected)
-    assert not torch.equal(densities(trained()), expected)
+    theta = standard_normal(1).sample((50,))
+    x, theta = simulate(theta), theta[None]
+    expected = log_prob(trained(kind=PlainNPE), theta, x)
+    assert torch.equal(log_prob(trained(regularisation=0), theta, x), expected)
+    assert not torch.equal(log_prob(trained(), theta, x), expected)
     frozen = nn.Linear(2, 2).requires_grad_(requires_grad=False)
     with pytest.warns(RoPEWarning, match="nothing to regularise"):
         robust = trained(net=frozen)
-    assert torch.equal(densities(robust), densities(trained(kind=PlainNPE, net=frozen)))
+    expected = log_prob(trained(kind=PlainNPE, net=frozen), theta, x)
+    assert torch.equal(log_prob(robust, theta, x), expected)
 
 
 def test_batch_statistics_are_those_of_the_simulations() -> None:
