@@ -12,7 +12,7 @@ def assert_refused(
     match: str,
     call: Callable[..., Any],
     *arguments: Any,
-    error: type[RoPEError] = RoPEError,
+    error: Any = RoPEError,
     **options: Any,
 ) -> None:
     """Fail unless a call raises an error of the package whose message matches."""

@@ -16,8 +16,7 @@ PAGES = sorted(
 
 def prose(page: Path) -> str:
     """Return a page without blocks of code, in which brackets are no links."""
-    text = page.read_text(encoding="utf-8")
-    return re.sub(r"^( *)```.*?^\1```$", "", text, flags=re.DOTALL | re.MULTILINE)
+    return re.sub(r"(?ms)^( *)```.*?^\1```$", "", page.read_text(encoding="utf-8"))
 
 
 def anchors(page: Path) -> set[str]:
