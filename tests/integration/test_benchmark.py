@@ -14,7 +14,7 @@ from benchmarks import runner
 from benchmarks.__main__ import main
 from benchmarks.cases import Case, Workplace
 from benchmarks.cells import Cell
-from benchmarks.figures import LPPAxis, draw_suite
+from benchmarks.figures import draw_suite
 from benchmarks.methods import METHODS, STACKS
 from benchmarks.presets import PRESETS
 from benchmarks.runner import run_cells
@@ -47,11 +47,9 @@ preset = "smoke"
 repetitions = 1
 
 [[cells]]
-tasks = ["pendulum"]
-methods = ["prior", "NPE", "tuning-only", "OT-only", "RoPE"]
+tasks = ["sir"]
+methods = ["prior", "NPE", "HVAE"]
 n_calibration = [10]
-gammas = { simulated = [0.1] }
-taus = [1.0, 0.9]
 """
 COUPLING: dict[str, Any] = {"gamma": 0.1, "tau": 1.0, "cost_scale": "simulated"}
 CELLS = [
@@ -59,8 +57,6 @@ CELLS = [
     Cell(task="cs", method="RoPE", n_calibration=10, **COUPLING),
     Cell(task="cs", method="MLP", n_calibration=50, options='{"label_noise": 0.1}'),
 ]
-# What may differ between two runs of the same cell.
-CHANGING = ("seconds_", "finished_at", "git_commit", "suite")
 
 
 def written(suite: str, folder: Path) -> str:
@@ -93,19 +89,13 @@ def test_a_suite_lists_every_combination_under_a_name_of_its_own(suite: Suite) -
     assert len({cell.data for cell in suite.cells}) == 2 * 2
 
 
-def test_cells_are_selected_by_their_fields(suite: Suite) -> None:
+def test_suites_and_cells_are_selected_by_name(suite: Suite) -> None:
     chosen = suite.select(method=["prior", "MLP"], n_calibration=[50], repetition=None)
     assert {(c.method, c.n_calibration) for c in chosen} == {("prior", 0), ("MLP", 50)}
     with pytest.raises(SystemExit, match=r"expected task among .*linear_gaussian"):
         suite.select(task=["sir"])
-
-
-def test_unknown_names_are_refused_with_the_known_ones(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match=r"No suite 'nonsense'; there are .*smoke"):
         load_suite("nonsense")
-    wrong = written(SUITE.replace("taus", "unheard-of"), tmp_path)
-    with pytest.raises(SystemExit, match=r"key among .*'taus'"):
-        load_suite(wrong)
 
 
 def test_the_suites_that_come_along_can_be_read_and_smoke_has_every_method() -> None:
@@ -183,19 +173,6 @@ def test_rows_of_another_suite_are_taken_over(tmp_path: Path) -> None:
     assert {*second.rows["suite"]} == {"second"}
 
 
-def test_status_counts_what_is_finished_and_what_is_not_run(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    suite = load_suite("smoke")
-    Results(tmp_path / "smoke").add(
-        [result_of(suite.cells[0], -1.0), result_of(suite.cells[1], "failed")]
-    )
-    assert main(["status", "--out", str(tmp_path)]) == 0
-    total = len(suite.cells)
-    printed = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert ["smoke", str(total), "1", "1", str(total - 2)] in printed
-
-
 @pytest.mark.medium
 def test_a_suite_is_drawn_with_failures_and_what_is_not_finite(
     suite: Suite, tmp_path: Path
@@ -206,16 +183,6 @@ def test_a_suite_is_drawn_with_failures_and_what_is_not_finite(
     results.add(result_of(cell, scores[cell.method]) for cell in suite.cells)
     draw_suite(suite, results.rows, results.folder)
     assert [path.name for path in results.folder.glob("*.png")] == ["n_calibration.png"]
-
-
-def test_the_axis_of_figures_is_linear_above_the_prior_and_logarithmic_below() -> None:
-    axis = LPPAxis(prior=-4.0, top=2.0)
-    values = np.array([-1000.0, -40.0, -4.0, -1.0, 2.0])
-    heights = axis.forward(values)
-    assert np.allclose(axis.inverse(heights), values)
-    assert heights[2:].tolist() == [0.0, 0.5, 1.0]
-    assert axis.forward(-4.0 - 6 * 11) == pytest.approx(-2.0)
-    assert axis.forward(-4.0 - 6 * 111) == pytest.approx(-3.0)
 
 
 # Runs -------------------------------------------------------------------------------
@@ -274,42 +241,22 @@ def test_only_what_another_version_has_made_is_computed_again(
         assert "0 kept, 1 finished" in capsys.readouterr().out
 
 
-@pytest.mark.slow
-def test_a_stopped_run_resumes_in_parallel_to_the_same_table(tmp_path: Path) -> None:
-    suite, tables = written(SMALL, tmp_path), []
-    for name, commands in {
-        "whole": [[]],
-        "stopped": [["--method", "NPE", "OT-only"], ["--jobs", "2"]],
-    }.items():
-        for more in commands:
-            assert main(["run", suite, "--out", str(tmp_path / name), *more]) == 0
-        rows = Results(tmp_path / name / "tiny").rows
-        same = [one for one in rows.columns if not one.startswith(CHANGING)]
-        tables.append(rows[same])
-    assert len(tables[0]) == 7
-    pd.testing.assert_frame_equal(*tables)
-
-
 @pytest.mark.medium
 def test_a_failing_method_does_not_stop_the_others_and_is_no_success(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    command = ["run", written(SMALL, tmp_path), "--out", str(tmp_path), "--method"]
     # HVAE needs a differentiable simulator, which this task has not.
-    suite = (
-        'preset = "smoke"\nrepetitions = 1\n[[cells]]\ntasks = ["sir"]\n'
-        'methods = ["HVAE", "prior"]\nn_calibration = [10]\n'
-    )
-    command = ["run", written(suite, tmp_path), "--out", str(tmp_path)]
     for more, counts in (
         ([], "0 kept, 1 finished, 1 failed"),
         ([], "2 kept, 0 finished, 0 failed"),
         (["--retry"], "1 kept, 0 finished, 1 failed"),
     ):
-        assert main([*command, *more]) == 1
+        assert main([*command, "HVAE", "prior", *more]) == 1
         printed = capsys.readouterr().out
         assert counts in printed
         assert "failed: sir HVAE n_c=10 #0: " in printed
-    assert main([*command, "--method", "prior"]) == 0
+    assert main([*command, "prior"]) == 0
 
 
 def test_methods_see_the_same_data_and_repetitions_do_not(tmp_path: Path) -> None:

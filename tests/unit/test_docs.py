@@ -41,16 +41,6 @@ def test_links_between_pages_lead_to_files_and_headings_that_exist() -> None:
     assert broken == []
 
 
-def test_pages_that_the_code_names_exist() -> None:
-    named = {
-        name
-        for folder in ("sbi_rope", "benchmarks", "examples", "docs")
-        for file in (ROOT / folder).rglob("*.py")
-        for name in re.findall(r"\bdocs/[\w/]+\.(?:md|png|py)\b", file.read_text())
-    }
-    assert [name for name in sorted(named) if not (ROOT / name).exists()] == []
-
-
 def test_the_reference_describes_all_that_the_package_exports() -> None:
     page = (ROOT / "docs/reference/sbi_rope.md").read_text()
     described = re.findall(r"^\.\. auto\w+:: (\w+)$", page, flags=re.MULTILINE)
