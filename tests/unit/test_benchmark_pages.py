@@ -2,12 +2,11 @@
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from benchmarks.cells import Cell
 from benchmarks.figures import draw_overview
 from benchmarks.pages import BLOCK, BLOCKS, pages_with_blocks, write_pages
 from benchmarks.published import FIXED, PAPER, Published
@@ -19,31 +18,22 @@ pytestmark = pytest.mark.usefixtures("rough_pictures")
 
 ROOT = Path(__file__).parents[2]
 COMMITTED = ROOT / "benchmarks" / "results"
-# A cell to its LPP, or None if it was not run, or "failed".
-Scores = Callable[[Cell], float | str | None]
 
 
-def published(folder: Path, scores: Scores) -> Published:
-    """Make up the results of `main`."""
-    Results(folder / "main").add(
-        result_of(cell, score, 0.02)
-        for cell in load_suite("main").cells
-        if (score := scores(cell)) is not None
-    )
+def published(folder: Path, task: str, runs: list[dict[str, Any]]) -> Published:
+    """Make up results of `main` on a task, by repetition.
+
+    Methods have an LPP, "failed", or None if they were not run; -5 if nothing is said.
+    """
+    results = []
+    for cell in load_suite("main").cells:
+        if cell.task == task and cell.repetition < len(runs):
+            other = (cell.gamma, cell.tau, cell.cost_scale) != FIXED
+            name = f"{cell.method}, other" if cell.gamma and other else cell.method
+            score = runs[cell.repetition].get(name, -5.0)
+            results += [] if score is None else [result_of(cell, score, 0.02)]
+    Results(folder / "main").add(results)
     return Published.read(folder)
-
-
-def on(task: str, by_repetition: Sequence[Mapping[str, float | str | None]]) -> Scores:
-    """Scores of methods on a task by repetition; -5 if nothing is said."""
-
-    def scores(cell: Cell) -> float | str | None:
-        if cell.task != task or cell.repetition >= len(by_repetition):
-            return None
-        other = (cell.gamma, cell.tau, cell.cost_scale) != FIXED
-        name = f"{cell.method}, other" if cell.gamma and other else cell.method
-        return by_repetition[cell.repetition].get(name, -5.0)
-
-    return scores
 
 
 def line(lines: list[str], start: str) -> list[str]:
@@ -68,7 +58,7 @@ def test_committed_pages_are_those_of_the_tables(tmp_path: Path) -> None:
 
 
 def test_only_places_of_tables_are_written(tmp_path: Path) -> None:
-    results = published(tmp_path, on("cs", [{}]))
+    results = published(tmp_path, "cs", [{}])
     page = tmp_path / "page.md"
     begin, end = "<!-- results: costs -->\n", "<!-- /results -->\n"
     page.write_text(f"before\n{begin}old\n{end}after\n")
@@ -81,12 +71,12 @@ def test_only_places_of_tables_are_written(tmp_path: Path) -> None:
 def test_the_stack_is_compared_with_the_best_other(tmp_path: Path) -> None:
     lpps = -1.0, -1.2, -1.1
     ours = [{"stack": lpp, "J-NPE": -1.5} for lpp in lpps]
-    results = published(tmp_path, on("cs", ours))
+    results = published(tmp_path, "cs", ours)
     assert BLOCKS["goals"](results)[3].endswith("over repetitions: 3 of 3")
     # Nothing is lost anywhere.
     assert len(BLOCKS["not-the-best"](results)) == 2
     theirs = [{"stack": -1.5, "J-NPE": lpp} for lpp in lpps]
-    lines = BLOCKS["not-the-best"](published(tmp_path, on("cs", theirs)))
+    lines = BLOCKS["not-the-best"](published(tmp_path, "cs", theirs))
     row = line(lines, "A cs | 50")
     # 4.303 is Student's quantile of two degrees of freedom.
     gap = f"-0.40 ± {4.303 * 0.1 / 3**0.5:.2f}"
@@ -95,11 +85,11 @@ def test_the_stack_is_compared_with_the_best_other(tmp_path: Path) -> None:
 
 def test_methods_that_see_more_or_are_ours_are_counted_apart(tmp_path: Path) -> None:
     lpp = {"stack": -1.0, "RVNP": -0.5, "discrepancy": -1.0, "J-NPE": -1.5, "NPE": -0.8}
-    goals = BLOCKS["goals"](published(tmp_path, on("cs", [lpp, lpp])))
+    goals = BLOCKS["goals"](published(tmp_path, "cs", [lpp, lpp]))
     assert [goal.split(": ")[-1] for goal in goals[1:6]] == ["0 of 3"] * 5
     assert "|ACAUC| of 0.020" in goals[6]
     lpp |= {"RVNP": -1.5, "NPE": -1.5}
-    goals = BLOCKS["goals"](published(tmp_path, on("cs", [lpp, lpp])))
+    goals = BLOCKS["goals"](published(tmp_path, "cs", [lpp, lpp]))
     counts = [goal.split(": ")[-1] for goal in goals[1:6]]
     # A candidate of ours is as good, so that the stack is above all others only.
     assert counts == ["3 of 3", "3 of 3", "0 of 3", "3 of 3", "3 of 3"]
@@ -110,7 +100,7 @@ def test_the_best_has_all_repetitions_and_the_fixed_setting(tmp_path: Path) -> N
     usual = {"NPE": -1.0, "SBI": 0.0, "RoPE": -2.0, "RoPE, other": -0.5}
     first = usual | {"MLP": -0.1, "prior": -math.inf, "NNPE": None}
     runs = [first, usual | {"MLP": -0.1}, usual | {"MLP": "failed"}]
-    lines = BLOCKS["lpp"](published(tmp_path, on("cs", runs)))
+    lines = BLOCKS["lpp"](published(tmp_path, "cs", runs))
     assert line(lines, "NPE") == ["**-1.00 ± 0.00**"]
     assert line(lines, "MLP") == ["-0.10 ± 0.00 (1 of 3 failed)"]
     assert line(lines, "NNPE") == ["-5.00 ± 0.00 [2]"]
@@ -127,7 +117,7 @@ def test_readme_shows_scores_with_their_intervals(tmp_path: Path) -> None:
         {"stack": -1.2, "RoPE": None, fmcpe: -6.0},
         {"stack": -1.1, "RoPE": None, fmcpe: "failed"},
     ]
-    lines = BLOCKS["readme"](published(tmp_path, on("light_tunnel_sensors", runs)))
+    lines = BLOCKS["readme"](published(tmp_path, "light_tunnel_sensors", runs))
     stack = "-1.10 ± 0.25 (3)"  # 4.303 * 0.1 / sqrt(3)
     assert line(lines, "**`stack`**") == [stack, stack, stack, "+0.020"]
     # Of one repetition the interval is over its test observations.
@@ -137,7 +127,7 @@ def test_readme_shows_scores_with_their_intervals(tmp_path: Path) -> None:
 
 @pytest.mark.medium
 def test_what_was_run_is_counted_and_drawn(tmp_path: Path) -> None:
-    results = published(tmp_path, on("cs", [{"MLP": "failed"}]))
+    results = published(tmp_path, "cs", [{"MLP": "failed"}])
     draw_overview(results)
     drawn = {path.name for path in tmp_path.glob("*.png")}
     assert drawn == {"methods.png", "ranks.png"}
