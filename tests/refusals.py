@@ -1,6 +1,5 @@
 """Bad inputs must be refused with an error of the package that says what is wrong."""
 
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -10,7 +9,7 @@ from sbi_rope.utils.errors import RoPEError
 
 def assert_refused(
     match: str,
-    call: Callable[..., Any],
+    call: Any,
     *arguments: Any,
     error: Any = RoPEError,
     **options: Any,

@@ -75,10 +75,7 @@ def test_axes_of_a_pair_plot_reach_at_most_one_width_of_the_prior_beyond_it() ->
 @pytest.mark.medium
 def test_pair_plot_draws_samples_without_an_area() -> None:
     x = torch.linspace(0, 1, 300)
-    for samples in (
-        torch.tensor([[1.0, 2.0]]).repeat(200, 1),
-        torch.stack([x, 2 * x], dim=1),
-    ):
+    for samples in (torch.ones(200, 2), torch.stack([x, 2 * x], dim=1)):
         figure = plots.pair_plot({"same": samples, "RoPE": torch.randn(200, 2)})
         dots = [line for line in figure.axes[1].lines if line.get_marker() == "."]
         assert dots[0].get_xydata().tolist() == samples.tolist()
