@@ -8,11 +8,7 @@ from sbi_rope.utils.errors import RoPEError
 
 
 def assert_refused(
-    match: str,
-    call: Any,
-    *arguments: Any,
-    error: Any = RoPEError,
-    **options: Any,
+    match: str, call: Any, *arguments: Any, error: Any = RoPEError, **options: Any
 ) -> None:
     """Fail unless a call raises an error of the package whose message matches."""
     with pytest.raises(error, match=match):
