@@ -42,7 +42,7 @@ exclude_patterns = ["_build", "**/sbi-logs"]
 # References inside the package are checked. The inventories of other packages would
 # need the network at every build.
 nitpicky = True
-OTHERS = r"(abc|collections|os|pathlib|sbi|torch)\..*|Figure|DirectPosterior"
+OTHERS = r"(abc|collections|numpy|os|pathlib|sbi|torch)\..*|Figure|DirectPosterior"
 # Modules inside of rooms, and rooms that are not on the pages.
 INSIDE = r"sbi_rope\.(_.*|[a-z_]+\.[a-z_]+\..*|(data|ensemble|labels|simulate)\..*)"
 nitpick_ignore_regex = [("py:.*", f"{OTHERS}|{INSIDE}")]

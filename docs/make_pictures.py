@@ -173,10 +173,8 @@ def other_prior(rope: RoPE, theta_o: Tensor, x_o: Tensor) -> "Figure":
 def learning_curve(report: Any) -> "Figure":
     """Draw the panel of the learning curve alone."""
     figure = plots.stacking_report(report)
-    *others, last = figure.axes
-    for axes in others:
+    for axes in figure.axes[:-1]:
         axes.remove()
-    last.set_box_aspect(None)
     return arranged(figure, columns=1, size=(5.5, 3.4))
 
 
@@ -232,7 +230,6 @@ def main() -> None:
     save(discrepancy(npe, simulator, theta_cal, x_cal), "discrepancy")
     save(gammas(rope, theta_o[OBSERVED], x_o), "gammas")
     save(other_prior(rope, theta_o, x_o), "other_prior")
-    save(plots.finetuning_history(rope.history), "finetuning")
     posterior = stack(rope, learning_curve=True, seed=0, **QUIET)
     print(posterior.report)
     save(learning_curve(posterior.report), "learning_curve")

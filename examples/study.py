@@ -225,7 +225,6 @@ class Study:
                 samples, theta_o[0], parameter_names=names, prior=prior
             ),
             "calibration": plots.calibration_curves(evaluations),
-            "finetuning": plots.finetuning_history(rope.history),
         }
         for kind, figure in figures.items():
             self._save(figure, f"{kind}_{name}")

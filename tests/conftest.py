@@ -27,8 +27,7 @@ def _seeded() -> Iterator[None]:
     with torch.random.fork_rng():
         if torch.cuda.is_available():
             torch.cuda.manual_seed_all(0)
-        # `torch.manual_seed` would take longer than most tests: without CUDA it
-        # remembers where it was called from.
+        # `torch.manual_seed` would take longer than most tests.
         torch.default_generator.manual_seed(0)
         yield
 
@@ -65,5 +64,5 @@ def rough_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def chamber_extract() -> Path:
-    """Folder with the first rows of recorded experiments, see ``tests/data``."""
+    """Return the folder with the first rows of recorded experiments."""
     return TEST_DATA / "causal_chamber"

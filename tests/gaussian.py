@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from sbi.inference import DirectPosterior
 from sbi.neural_nets.estimators.base import ConditionalDensityEstimator
-from torch import Tensor, nn
+from torch import Size, Tensor, nn
 from torch.distributions import Distribution, Independent, MultivariateNormal, Normal
 
 NOISE_STD = 0.5
@@ -27,7 +27,7 @@ class GaussianEstimator(ConditionalDensityEstimator):
         with torch.no_grad():
             linear.weight.copy_(GAIN * torch.eye(dim))
             linear.bias.zero_()
-        super().__init__(linear, torch.Size((dim,)), torch.Size((dim,)))
+        super().__init__(linear, Size((dim,)), Size((dim,)))
         # Keeps a parameter when the embedding is taken away.
         self.log_std = nn.Parameter(torch.tensor(POSTERIOR_STD).log().repeat(dim))
 
@@ -41,9 +41,7 @@ class GaussianEstimator(ConditionalDensityEstimator):
     def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
         return self._law(condition).log_prob(input)
 
-    def sample(
-        self, sample_shape: torch.Size, condition: Tensor, **kwargs: Any
-    ) -> Tensor:
+    def sample(self, sample_shape: Size, condition: Tensor, **kwargs: Any) -> Tensor:
         return self._law(condition).sample(sample_shape)
 
     def loss(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
@@ -69,9 +67,8 @@ def posterior(dim: int = 2) -> DirectPosterior:
 
 def exact_posterior(x_s: Tensor) -> Distribution:
     """theta | x_s, for the x_s a real observation came from."""
-    return Independent(
-        Normal(GAIN * x_s, torch.tensor(POSTERIOR_STD, dtype=x_s.dtype)), 1
-    )
+    std = torch.tensor(POSTERIOR_STD, dtype=x_s.dtype)
+    return Independent(Normal(GAIN * x_s, std), 1)
 
 
 def undo(x_o: Tensor) -> Tensor:

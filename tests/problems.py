@@ -69,6 +69,19 @@ def reproducible() -> Iterator[None]:
         yield
 
 
+def trained(trainer: Any, prior: Any, simulator: Any, builder: Any, epochs: int) -> Any:
+    """Train an estimator of sbi on 200 simulations."""
+    theta = prior.sample((200,))
+    x = simulator(theta)
+    inference = trainer(prior, builder, show_progress_bars=False)
+    # sbi warns by its logger if NaN is kept.
+    logging.disable()
+    inference.append_simulations(theta, x, exclude_invalid_x=False)
+    logging.disable(logging.NOTSET)
+    inference.train(max_num_epochs=epochs, training_batch_size=50)
+    return inference.build_posterior()
+
+
 @functools.cache
 def npe_posterior(
     family: str = "maf",
@@ -89,29 +102,17 @@ def npe_posterior(
         "cnn": SmallCNN,
     }[embedding]
     with reproducible():
-        net = make_net()
-        prior = mixed_prior(dim) if family in MIXED_FAMILIES else box(dim)
-        theta = prior.sample((200,))
-        x = (simulate_image if embedding == "cnn" else simulate)(theta)
         builder = posterior_nn(
             family,
             z_score_x=z_score_x,
-            embedding_net=net,
+            embedding_net=make_net(),
             hidden_features=16,
             num_transforms=1 if family == "zuko_unaf" else 2,
         )
+        prior = mixed_prior(dim) if family in MIXED_FAMILIES else box(dim)
         trainer = MNPE if family == "mnpe" else NPE
-        npe = trainer(prior, density_estimator=builder, show_progress_bars=False)
-        npe.append_simulations(theta, x)
-        npe.train(max_num_epochs=num_epochs, training_batch_size=50)
-        return npe.build_posterior()
-
-
-class Filled(nn.Module):
-    """Puts zeros where numbers are missing."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        return x.nan_to_num(0.0)
+        simulator = simulate_image if embedding == "cnn" else simulate
+        return trained(trainer, prior, simulator, builder, num_epochs)
 
 
 def simulate_trials(theta: Tensor) -> Tensor:
@@ -149,14 +150,7 @@ def trials_posterior(make_net: Callable[[], nn.Module] = TrialsNet) -> Any:
         builder = posterior_nn(
             "mdn", embedding_net=make_net(), z_score_x="none", hidden_features=10
         )
-        theta = box(2).sample((200,))
-        npe = NPE(box(2), density_estimator=builder, show_progress_bars=False)
-        # sbi warns by its logger that NaN is kept, which is meant here.
-        logging.disable()
-        npe.append_simulations(theta, simulate_trials(theta), exclude_invalid_x=False)
-        logging.disable(logging.NOTSET)
-        npe.train(max_num_epochs=5, training_batch_size=50)
-        return npe.build_posterior()
+        return trained(NPE, box(2), simulate_trials, builder, 5)
 
 
 @functools.cache
@@ -166,15 +160,9 @@ def vector_field_posterior(method: str) -> Any:
         "fmpe": (FMPE, posterior_flow_nn),
         "npse": (NPSE, posterior_score_nn),
     }[method]
-    net = nn.Linear(3, 4)
     with reproducible():
-        prior = box(2)
-        theta = prior.sample((200,))
-        estimator = builder("mlp", embedding_net=net, hidden_features=16)
-        inference = trainer(prior, estimator, show_progress_bars=False)
-        inference.append_simulations(theta, simulate(theta))
-        inference.train(max_num_epochs=2)
-        return inference.build_posterior()
+        estimator = builder("mlp", embedding_net=nn.Linear(3, 4), hidden_features=16)
+        return trained(trainer, box(2), simulate, estimator, 2)
 
 
 class Gaussians(ConditionalDensityEstimator):

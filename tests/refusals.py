@@ -1,6 +1,5 @@
 """Bad inputs must be refused with an error of the package that says what is wrong."""
 
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -9,11 +8,7 @@ from sbi_rope.utils.errors import RoPEError
 
 
 def assert_refused(
-    match: str,
-    call: Callable[..., Any],
-    *arguments: Any,
-    error: type[RoPEError] = RoPEError,
-    **options: Any,
+    match: str, call: Any, *arguments: Any, error: Any = RoPEError, **options: Any
 ) -> None:
     """Fail unless a call raises an error of the package whose message matches."""
     with pytest.raises(error, match=match):

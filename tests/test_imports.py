@@ -29,32 +29,24 @@ LAYER = {room: k for k, rooms in enumerate(LAYERS) for room in rooms.split()}
 PUBLIC_OF_SBI = {"", "inference", "neural_nets", "utils", "diagnostics", "analysis"}
 
 IMPORT = """
-import hashlib, importlib, json, pkgutil, random, socket, sys, warnings
+import importlib, json, pkgutil, socket, sys, warnings
 
-def refuse(*args, **kwargs):
-    raise RuntimeError("a socket was used")
-
-for name in ("connect", "connect_ex", "bind", "sendto"):
-    setattr(socket.socket, name, refuse)
-socket.getaddrinfo = socket.create_connection = refuse
+# Using one raises an error.
+socket.socket.connect = socket.getaddrinfo = socket.create_connection = None
 
 # What the package needs; these may import what they like.
 import ot, numpy, torch, tqdm.auto, sbi.inference, sbi.utils
 
 def state():
-    return dict(
-        dtype=str(torch.get_default_dtype()),
-        rng=hashlib.sha256(torch.get_rng_state().numpy().tobytes()).hexdigest(),
-        numpy=numpy.random.get_state()[1].tolist(),
-        random=repr(random.getstate()),
-        validate=torch.distributions.Distribution._validate_args,
-        grad=torch.is_grad_enabled(),
-        threads=torch.get_num_threads(),
-        deterministic=torch.are_deterministic_algorithms_enabled(),
-        filters=[str(f) for f in warnings.filters],
-    )
+    return [
+        str(torch.get_default_dtype()),
+        torch.get_rng_state().tolist(),
+        numpy.random.get_state()[1].tolist(),
+        torch.distributions.Distribution._validate_args,
+        torch.get_num_threads(),
+        [str(one) for one in warnings.filters],
+    ]
 
-torch.manual_seed(0); numpy.random.seed(0); random.seed(0)
 before, theirs = state(), set(sys.modules)
 import sbi_rope
 for module in pkgutil.iter_modules(sbi_rope.__path__, "sbi_rope."):
@@ -68,10 +60,7 @@ print(json.dumps(dict(new=new, before=before, after=state())))
 def test_importing_prints_nothing_loads_nothing_heavy_and_changes_no_state() -> None:
     # One test, because a fresh interpreter takes seconds to import torch and sbi.
     command = [sys.executable, "-c", IMPORT]
-    result = subprocess.run(
-        command, capture_output=True, text=True, check=False, timeout=120
-    )
-    # Using a socket would have raised an error.
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
     assert result.stderr == ""
     (report,) = result.stdout.splitlines()
@@ -81,12 +70,6 @@ def test_importing_prints_nothing_loads_nothing_heavy_and_changes_no_state() -> 
     assert packages - set(sys.stdlib_module_names) <= {"sbi_rope", "sbi"}
     assert "sbi.analysis" not in fresh["new"]
     assert fresh["after"] == fresh["before"]
-
-
-def test_what_is_promised_is_there() -> None:
-    for name in sbi_rope.__all__:
-        assert getattr(sbi_rope, name).__name__ == name
-    assert sbi_rope.__version__.count(".") == 2
 
 
 def imports() -> Iterator[tuple[Path, str, list[str]]]:
@@ -104,9 +87,11 @@ def imports() -> Iterator[tuple[Path, str, list[str]]]:
                 yield path, room, str(node.module).split(".")
 
 
-def test_rooms_import_from_lower_layers() -> None:
+def test_rooms_import_from_lower_layers_and_one_reaches_into_sbi() -> None:
     for path, room, names in imports():
         assert room in LAYER, f"give {room} a place"
+        if names[0] == "sbi" and room != "npe":
+            assert ".".join(names[1:]) in PUBLIC_OF_SBI, f"{path}: {'.'.join(names)}"
         if names[0] != "sbi_rope":
             continue
         assert len(names) > 1, f"{path} imports the package as a whole"
@@ -114,9 +99,3 @@ def test_rooms_import_from_lower_layers() -> None:
             assert LAYER[other] < LAYER[room], f"{path}: {room} imports {other}"
         # Tasks are problems for any method.
         assert room != "tasks" or other in {"tasks", "utils", "npe"}, f"{path}: {other}"
-
-
-def test_only_one_room_reaches_into_sbi() -> None:
-    for path, room, names in imports():
-        if names[0] == "sbi" and room != "npe":
-            assert ".".join(names[1:]) in PUBLIC_OF_SBI, f"{path}: {'.'.join(names)}"

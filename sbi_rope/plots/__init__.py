@@ -7,7 +7,6 @@ when a function is called. Install it with ``pip install sbi-rope[benchmarks]``.
 from sbi_rope.plots.diagnostics import (
     calibration_curves,
     discrepancy,
-    finetuning_history,
     implied_parameters,
 )
 from sbi_rope.plots.posteriors import credible_set, overview, pair_plot
@@ -17,7 +16,6 @@ __all__ = [
     "calibration_curves",
     "credible_set",
     "discrepancy",
-    "finetuning_history",
     "implied_parameters",
     "overview",
     "pair_plot",

@@ -34,17 +34,15 @@ def empty_figure(width: float, height: float) -> "Figure":
 
 
 def panel_grid(
-    count: int, *, columns: int, width: float, height: float, **options: Any
+    count: int, *, columns: int, width: float, height: float
 ) -> "tuple[Figure, list[Axes]]":
     """Return a figure with panels of a size, in at most as many columns."""
     rows, columns = -(-count // columns), min(count, columns)
     figure = empty_figure(width * columns, height * rows)
-    panels = list(figure.subplots(rows, columns, squeeze=False, **options).flat)
-    for axes in panels[count:]:
-        axes.remove()
-    for axes in panels[:count]:
+    panels = [figure.add_subplot(rows, columns, k + 1) for k in range(count)]
+    for axes in panels:
         hide_frame(axes)
-    return figure, panels[:count]
+    return figure, panels
 
 
 def hide_frame(axes: "Axes") -> None:
@@ -60,7 +58,7 @@ def draw_calibrated_band(
     width = 1.96 * (alpha * (1.0 - alpha) / num_observations).sqrt()
     axes.fill_between(alpha, alpha - width, alpha + width, color="0.85", label=label)
     axes.plot([0, 1], [0, 1], color=GREY, lw=0.8)
-    axes.set(xlim=(0, 1), ylim=(0, 1), box_aspect=1)
+    axes.set(xlim=(0, 1), ylim=(0, 1))
 
 
 def add_legend_above(figure: "Figure", axes: "Axes") -> None:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -20,19 +20,8 @@ if TYPE_CHECKING:
 # Shares that contours enclose, the most samples behind one, and points on its axes.
 SHARES, MAX_SAMPLES, GRID = (0.9, 0.5), 1000, 80
 TRUTH: dict[str, Any] = dict(color="black", lw=1.2, marker="X", ms=8, mec="w", zorder=5)
-
-
-class Posteriors(NamedTuple):
-    """Samples and line styles by label, and what is drawn with them.
-
-    ``limits`` of axes, and ``prior``, the central 99 % of the prior, are ``(2, d)``.
-    """
-
-    draws: dict[str, tuple[Tensor, dict[str, Any]]]
-    truth: Tensor | None
-    names: list[str]
-    limits: Tensor
-    prior: Tensor | None
+# Samples and their line style by label.
+Draws = dict[str, tuple[Tensor, dict[str, Any]]]
 
 
 def as_posteriors(
@@ -40,8 +29,11 @@ def as_posteriors(
     theta: Tensor | None,
     parameter_names: Sequence[str] | None,
     prior: Tensor | None,
-) -> Posteriors:
-    """Return what a user wants to draw. Labels say if many samples are outside."""
+) -> tuple[Draws, Tensor | None, list[str], Tensor, Tensor | None]:
+    """Return draws, truth, names, limits of axes, and ends of the prior, ``(2, d)``.
+
+    Labels say if many samples are outside the axes.
+    """
     draws, truth, names = as_samples(samples, theta, parameter_names)
     spans = torch.stack([central_interval(value) for value in draws.values()])
     if prior is not None:
@@ -62,7 +54,7 @@ def as_posteriors(
         is_large = outside > 0.05 + 0.01 * len(names)
         label = f"{name} ({100 * outside:.0f} % outside)" if is_large else name
         found[label] = draws[name], style
-    return Posteriors(found, truth, names, limits, prior)
+    return found, truth, names, limits, prior
 
 
 def as_samples(
@@ -145,17 +137,19 @@ def corner_legend(figure: "Figure", handles: list[Any]) -> None:
     figure.legend(handles=handles, loc=place, frameon=False)
 
 
-def draw_posteriors(axes: "Axes", posteriors: Posteriors, shown: list[int]) -> None:
+def draw_posteriors(
+    axes: "Axes", draws: Draws, prior: Tensor | None, shown: list[int]
+) -> None:
     """Draw one or two parameters of posteriors on the shaded interval of the prior."""
-    for label, (values, style) in posteriors.draws.items():
+    for label, (values, style) in draws.items():
         axes.plot([], [], label=label, **style)  # for the legend
         if len(shown) == 1:
             draw_marginal(axes, values[:, shown[0]], style)
         else:
             draw_contours(axes, values[:, shown], style)
-    if posteriors.prior is not None:
+    if prior is not None:
         shade = {"color": PRIOR, "lw": 0, "zorder": 0, "label": "prior"}
-        sides, *ends = posteriors.prior[:, shown].T.tolist()
+        sides, *ends = prior[:, shown].T.tolist()
         if ends:
             axes.fill_between(sides, *ends[0], **shade)
         else:

@@ -1,4 +1,4 @@
-"""Pictures of discrepancies, calibration, diagnoses and fine-tuning."""
+"""Pictures of discrepancies, calibration and diagnoses."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,6 @@ from sbi_rope.metrics.evaluation import NOMINAL
 from sbi_rope.plots._figures import (
     BLUE,
     GREY,
-    VERMILLION,
     add_legend_above,
     draw_calibrated_band,
     empty_figure,
@@ -23,14 +22,12 @@ from sbi_rope.plots._figures import (
     panel_grid,
 )
 from sbi_rope.plots._samples import central_interval, with_margin
-from sbi_rope.rope.finetuning import History
 from sbi_rope.utils.settings import check
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# The most summaries that are drawn.
-MAX_SUMMARIES = 20
+MAX_SUMMARIES = 20  # the most that are drawn
 
 
 def discrepancy(report: DiscrepancyReport) -> "Figure":
@@ -110,6 +107,7 @@ def calibration_curves(evaluations: Mapping[str, Evaluation]) -> "Figure":
         curve = evaluations[name].coverage.nanmean(dim=1).cpu()
         axes.plot(NOMINAL, curve, label=name, **style)
     axes.set(xlabel="credible level", ylabel="share of true parameters inside")
+    axes.set_box_aspect(1)
     note = {"color": GREY, "size": "small", "transform": axes.transAxes}
     axes.text(0.03, 0.97, "under-confident", va="top", **note)
     axes.text(0.97, 0.03, "over-confident", ha="right", **note)
@@ -135,55 +133,26 @@ def implied_parameters(diagnosis: Diagnosis) -> "Figure":
     names = diagnosis.parameter_names
     figure, panels = panel_grid(len(names), columns=4, width=3.4, height=2.7)
     figure.set_figheight(figure.get_figheight() + 0.5)
-    lines: dict[str, dict[str, Any]] = {
-        "implied by a batch of the prior": {"color": GREY, "ls": "--"},
-        "implied by this batch": {"color": BLUE},
-    }
+    lines = (
+        ("implied by a batch of the prior", diagnosis.unshifted, GREY, "--"),
+        ("implied by this batch", diagnosis.implied, BLUE, "-"),
+    )
     for k, (axes, name) in enumerate(zip(panels, names, strict=True)):
         theta, prior = diagnosis.theta[:, k], diagnosis.prior[:, k]
-        whole = torch.stack([prior.min(), prior.max()])
-        ends = central_interval(prior[:, None])[:, 0]
+        ends, whole = central_interval(prior[:, None])[:, 0], torch.aminmax(prior)
         # A prior without tails is shown as a whole.
-        if whole[1] - whole[0] < 1.1 * (ends[1] - ends[0]):
-            ends = whole
+        if whole.max - whole.min < 1.1 * (ends[1] - ends[0]):
+            ends = torch.stack(whole)
         low, high = ends.tolist()
-        axes.set(xlim=with_margin(ends[:1], ends[1:])[:, 0].tolist(), xlabel=name)
+        axes.set(xlim=with_margin(*ends).tolist(), xlabel=name)
         axes.set_yticks([])
         options: dict[str, Any] = {"bins": np.linspace(low, high, 21), "density": True}
         # The outermost bins hold the tails, so that nothing is cut off.
         axes.hist(prior.clamp(low, high), color="0.85", label="prior", **options)
-        weights = diagnosis.unshifted, diagnosis.implied
         options |= {"histtype": "step", "lw": 1.6}
-        for (label, style), weight in zip(lines.items(), weights, strict=True):
-            values = theta.clamp(low, high)
-            axes.hist(values, weights=weight, label=label, **style, **options)
+        for label, weights, colour, line in lines:
+            options |= {"label": label, "color": colour, "ls": line}
+            axes.hist(theta.clamp(low, high), weights=weights, **options)
     panels[0].set_ylabel("density")
     add_legend_above(figure, panels[0])
-    return figure
-
-
-def finetuning_history(history: History) -> "Figure":
-    """Draw the losses of a fine-tuning and mark the step that was kept.
-
-    Args:
-        history: The losses before each step and after the last, ``rope.history``.
-            Without held-out pairs only the training loss is drawn.
-
-    Returns:
-        The figure.
-    """
-    figure, axes = new_figure(6.0, 3.6)
-    loss = history.training_loss
-    axes.plot(loss, label="training pairs", color=BLUE, lw=1.2)
-    if history.validation_loss:
-        loss = history.validation_loss
-        axes.plot(loss, label="held-out pairs", color=VERMILLION, lw=1.2)
-    step = history.best_epoch
-    kept = f"kept: step {step}{'' if step else ' (the starting point)'}"
-    axes.axvline(step, color=GREY, lw=0.8)
-    axes.plot(step, loss[step], "o", color="black", ms=5, clip_on=False, label=kept)
-    axes.set(xlim=(0, max(len(loss) - 1, 1)), ylim=(0, None), xlabel="step")
-    axes.locator_params("x", integer=True)
-    axes.set_ylabel("mean distance to the target\n(units of the embedding)")
-    axes.legend(frameon=False)
     return figure

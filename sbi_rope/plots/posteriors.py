@@ -72,11 +72,11 @@ def pair_plot(
     Returns:
         The figure, with d rows and columns and the marginals on the diagonal.
     """
-    posteriors = as_posteriors(samples, theta, parameter_names, prior)
-    names, limits, truth = posteriors.names, posteriors.limits, posteriors.truth
+    drawn = as_posteriors(samples, theta, parameter_names, prior)
+    draws, truth, names, limits, ends = drawn
     figure, panels = corner_panels(names, limits, truth)
     for axes, shown in panels:
-        draw_posteriors(axes, posteriors, shown)
+        draw_posteriors(axes, draws, ends, shown)
     corner_legend(figure, panels[0][0].get_legend_handles_labels()[0])
     return figure
 
@@ -194,7 +194,8 @@ def overview(
         as_drawn("after", after, width),
     )
     weights = as_drawn("weights", weights, (), rows=len(simulated))
-    posteriors = as_posteriors(samples, theta, parameter_names, prior)
+    drawn = as_posteriors(samples, theta, parameter_names, prior)
+    draws, truth, names, limits, ends = drawn
     figure = empty_figure(9.6, 3.9)
     tune, couple, mix = figure.subplots(1, 3)
 
@@ -205,13 +206,11 @@ def overview(
         (before, VERMILLION, "--", "real, before tuning"),
         (after, BLUE, "-", "real, after tuning"),
     ):
-        style = {"color": colour, "linestyle": line}
-        draw_contours(tune, points, style, shares=[0.9])
+        draw_contours(tune, points, {"color": colour, "linestyle": line}, shares=[0.9])
         style = {"s": 9, "color": colour, "alpha": 0.7, "label": label}
         tune.scatter(*points[:MAX_REAL].T, **style, **DOTS)
     tune.plot(*after[0].tolist(), **STAR, zorder=6)
-    ends = after[0].tolist(), before[0].tolist()
-    tune.annotate("", *ends, arrowprops=ARROW, zorder=7)
+    tune.annotate("", after[0].tolist(), before[0].tolist(), arrowprops=ARROW, zorder=7)
 
     _draw_simulations(couple, simulated, after[:1])
     couple.plot(*after[0].tolist(), **STAR, ls="", zorder=6, label="a real observation")
@@ -223,10 +222,9 @@ def overview(
     label = f"its {count:.0f} or so simulations"
     couple.plot([], [], "o", color=BLUE, mew=0, label=label)
 
-    names, limits, truth = posteriors.names, posteriors.limits, posteriors.truth
     shown = list(range(len(names)))[:2]
     set_up_panel(mix, names, limits, truth, shown)
-    draw_posteriors(mix, posteriors, shown)
+    draw_posteriors(mix, draws, ends, shown)
     # The legends are below the panels, because points can be in any corner inside.
     style = {"frameon": False, "loc": "upper center"}
     tune.legend(**style, bbox_to_anchor=(0.5, -0.08), markerscale=2)

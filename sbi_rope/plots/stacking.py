@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# How far the axis of scores reaches below the best, in distances of the median to it.
-REACH = 4.0
 SMALL, UNIT = 10, "nats a pair, theta in its own units"
 
 
@@ -71,7 +69,6 @@ def stacking_report(report: StackingReport) -> "Figure":
     weights.set_xlabel("weight in the stack", fontsize=SMALL)
     coverage = figure.add_subplot(places[0])
     draw_calibrated_band(coverage, round(report.held_out.num_independent))
-    coverage.set_box_aspect(None)  # as high as the panels beside it
     coverage.plot(NOMINAL, report.held_out.coverage.nanmean(dim=1).cpu(), color=BLUE)
     coverage.set(xlabel="credible level", ylabel="share of hold-out pairs inside")
     if curve is not None:
@@ -88,7 +85,11 @@ def _draw_scores(
         row["candidate"]: Estimate(row["score"], row["score_low"], row["score_high"])
         for row in rows
     }
-    floor = _floor([one.mean for one in found.values()])
+    # Scores four times as far below the best as the median is are drawn as arrows, so
+    # that the others can be told apart.
+    means = sorted(one.mean for one in found.values() if math.isfinite(one.mean))
+    best, median = (means[-1], means[(len(means) - 1) // 2]) if means else (0.0, 0.0)
+    floor = best - max(4.0 * (best - median), 1.0)
     # Arrows are at the edge: no interval of the others reaches beyond them.
     near = [one.low for one in found.values() if one.mean >= floor]
     edge = min([floor, *(low for low in near if math.isfinite(low))])
@@ -120,24 +121,11 @@ def _draw_estimate(axes: "Axes", position: int, one: Estimate, **style: Any) -> 
     axes.errorbar(one.mean, position, xerr=xerr, **style)
 
 
-def _floor(scores: Sequence[float]) -> float:
-    """Return the score below which an arrow is drawn, so that others can be told apart.
-
-    It is four times as far below the best score as the median is.
-    """
-    ordered = sorted(score for score in scores if math.isfinite(score)) or [0.0]
-    best, middle = ordered[-1], ordered[(len(ordered) - 1) // 2]
-    return best - max(REACH * (best - middle), 1.0)
-
-
 def _draw_learning_curve(axes: "Axes", curve: LearningCurve) -> None:
     means, low, high = torch.tensor([[*vars(one).values()] for one in curve.scores]).T
     style: dict[str, Any] = {"fmt": "o-", "color": BLUE, "capsize": 3}
     axes.errorbar(curve.num_pairs, means, yerr=[means - low, high - means], **style)
-    axes.set(
-        xscale="log",
-        xlabel="pairs trained on",
-        ylabel=f"log density of hold-out pairs,\n{UNIT}",
-    )
+    axes.set(xscale="log", xlabel="pairs trained on")
+    axes.set_ylabel(f"log density of hold-out pairs,\n{UNIT}")
     axes.set_xticks(curve.num_pairs, [str(n) for n in curve.num_pairs])
     axes.minorticks_off()

@@ -2,7 +2,7 @@
 
 import base64
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib import metadata
 from os import PathLike
@@ -13,7 +13,7 @@ from sbi_rope.diagnosis import Diagnosis
 from sbi_rope.plots import discrepancy, implied_parameters, stacking_report
 from sbi_rope.stacking import StackingReport
 from sbi_rope.stacking.report import METHODS, headline, sections_of
-from sbi_rope.utils.settings import check, names_of
+from sbi_rope.utils.settings import check
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,7 +35,6 @@ def write_html(
     path: str | PathLike[str],
     *,
     diagnosis: Diagnosis | None = None,
-    parameter_names: Sequence[str] | None = None,
     x_names: Sequence[str] | None = None,
 ) -> None:
     """Write the report of a stack as one HTML file that can be sent to somebody.
@@ -46,24 +45,17 @@ def write_html(
     Args:
         report: The ``report`` of the posterior that :func:`sbi_rope.stack` returned.
         path: The file, which is replaced. Its folder is made if there is none.
-        diagnosis: What :func:`sbi_rope.diagnose` says about a batch, if the report
-            should hold it.
-        parameter_names: A name for each parameter. If None, those that ``RoPE`` was
-            given, or "theta_1" and so on.
+        diagnosis: What :func:`sbi_rope.diagnose` says about a batch, if anything.
         x_names: A name for each entry of x; "x[0]" and so on if None.
 
     Raises:
-        InvalidInputError: If the names do not fit.
+        InvalidInputError: If there are other names than entries of x.
     """
     check("report", report, StackingReport)
     check("diagnosis", diagnosis, Diagnosis | None)
-    if parameter_names is not None:
-        names = names_of(parameter_names, len(report.held_out.names))
-        held_out = replace(report.held_out, parameter_names=names)
-        report = replace(report, held_out=held_out)
     if x_names is not None and report.discrepancy is not None:
         report = replace(report, discrepancy=report.discrepancy.renamed(x_names))
-    parts = list(_parts(report))
+    parts = _parts(report)
     if diagnosis is not None:
         found = diagnosis.findings
         lines = [(f"{one.name}: {one.sentence}", one.alarming) for one in found]
@@ -80,7 +72,6 @@ def write_html(
         lstrip_blocks=True,
     )
     text = environment.get_template("page.html.j2").render(
-        title="Repaired posterior: report",
         version=metadata.version("sbi-rope"),
         headline=headline(report),
         sections=parts,
@@ -90,9 +81,9 @@ def write_html(
     file.write_text(text, encoding="utf-8")
 
 
-def _parts(report: StackingReport) -> Iterator[_Part]:
-    """Yield the sections of the printed report, with their tables and pictures."""
-    helped, trust, simulator, more = (_Part(*one) for one in sections_of(report))
+def _parts(report: StackingReport) -> list[_Part]:
+    """Return the sections of the printed report, with their tables and pictures."""
+    parts = helped, _, simulator, _ = [_Part(*one) for one in sections_of(report)]
     helped.heads = "candidate", "method", "weight", "nats a pair", "in prior units"
     helped.rows = [
         (
@@ -110,8 +101,6 @@ def _parts(report: StackingReport) -> Iterator[_Part]:
         "the curves of calibrated posteriors."
     )
     helped.picture = _encoded(stacking_report(report)), caption
-    yield helped
-    yield trust
     if (found := report.discrepancy) is not None:
         simulator.heads = "entry", "size", "shift", "gain", "error", "no discrepancy"
         simulator.rows = [
@@ -127,8 +116,7 @@ def _parts(report: StackingReport) -> Iterator[_Part]:
             "simulations; the last column is the probability of no discrepancy."
         )
         simulator.picture = _encoded(discrepancy(found)), caption
-    yield simulator
-    yield more
+    return parts
 
 
 def _encoded(figure: "Figure") -> str:

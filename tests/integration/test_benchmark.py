@@ -1,14 +1,12 @@
-"""The benchmark's runner on real cells, interrupted, in parallel, and with failures."""
+"""The benchmark's cells, results and figures, and its runner on real cells."""
 
-import csv
-import subprocess
-import sys
-import time
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
@@ -16,13 +14,17 @@ from benchmarks import runner
 from benchmarks.__main__ import main
 from benchmarks.cases import Case, Workplace
 from benchmarks.cells import Cell
+from benchmarks.figures import draw_suite
 from benchmarks.methods import METHODS, STACKS
-from benchmarks.runner import code_version, run_cells
+from benchmarks.presets import PRESETS
+from benchmarks.runner import run_cells
 from benchmarks.scoring import score
 from benchmarks.store import Results
-from benchmarks.suites import load_suite
+from benchmarks.suites import Suite, list_suites, load_suite
 from sbi_rope import SinkhornCoupler
 from sbi_rope.baselines import OTOnly
+from sbi_rope.tasks import get_task, list_tasks
+from sbi_rope.utils.files import write_atomically
 from tests.results import result_of
 
 pytestmark = pytest.mark.usefixtures("rough_pictures")
@@ -30,45 +32,160 @@ pytestmark = pytest.mark.usefixtures("rough_pictures")
 ROOT = Path(__file__).parents[2]
 SUITE = """
 preset = "smoke"
+repetitions = 2
+
+[[cells]]
+tasks = ["linear_gaussian"]
+methods = ["prior", "MLP", "OT-only", "RoPE"]
+n_calibration = [10, 50]
+gammas = { simulated = [0.1, 0.2], none = [0.5] }
+taus = [1.0, 0.9]
+options = { dim = [2, 3] }
+"""
+SMALL = """
+preset = "smoke"
 repetitions = 1
 
 [[cells]]
-tasks = ["pendulum"]
-methods = ["prior", "NPE", "tuning-only", "OT-only", "RoPE"]
+tasks = ["sir"]
+methods = ["prior", "NPE", "HVAE"]
 n_calibration = [10]
-gammas = { simulated = [0.1] }
-taus = [1.0, 0.9]
 """
-# What may differ between two runs of the same cell.
-CHANGING = ("seconds_", "finished_at", "git_commit", "suite")
+COUPLING: dict[str, Any] = {"gamma": 0.1, "tau": 1.0, "cost_scale": "simulated"}
+CELLS = [
+    Cell(task="cs", method="prior"),
+    Cell(task="cs", method="RoPE", n_calibration=10, **COUPLING),
+    Cell(task="cs", method="MLP", n_calibration=50, options='{"label_noise": 0.1}'),
+]
 
 
-@pytest.fixture
-def suite_file(tmp_path: Path) -> str:
-    path = tmp_path / "tiny.toml"
-    path.write_text(SUITE)
+def written(suite: str, folder: Path) -> str:
+    path = folder / "tiny.toml"
+    path.write_text(suite)
     return str(path)
 
 
-def rows_of(folder: Path) -> list[dict[str, str]]:
-    with (folder / "tiny" / "results.csv").open(newline="") as file:
-        return [
-            {k: v for k, v in row.items() if not k.startswith(CHANGING)}
-            for row in csv.DictReader(file)
-        ]
+@pytest.fixture
+def suite(tmp_path: Path) -> Suite:
+    return load_suite(written(SUITE, tmp_path))
 
 
-def test_status_counts_what_is_finished_and_what_is_not_run(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def smoke_case(task: str, folder: Path, **fields: Any) -> Case:
+    fields = {"method": "NPE", "n_calibration": 10} | fields
+    return Case(Cell(task=task, preset="smoke", **fields), Workplace(folder))
+
+
+# Cells and suites -------------------------------------------------------------------
+
+
+def test_a_suite_lists_every_combination_under_a_name_of_its_own(suite: Suite) -> None:
+    assert len({cell.key for cell in suite.cells}) == len(suite.cells)
+    methods = pd.Series([cell.method for cell in suite.cells]).value_counts()
+    # Two repetitions and two dimensions; sizes and couplings only where they matter.
+    assert methods.to_dict() == {"prior": 4, "MLP": 8, "OT-only": 24, "RoPE": 48}
+    # Repetition, dimension, size, cost scale: gamma and tau share a training.
+    trainings = {cell.training for cell in suite.cells if cell.method == "RoPE"}
+    assert len(trainings) == 2 * 2 * 2 * 2
+    assert len({cell.data for cell in suite.cells}) == 2 * 2
+
+
+def test_suites_and_cells_are_selected_by_name(suite: Suite) -> None:
+    chosen = suite.select(method=["prior", "MLP"], n_calibration=[50], repetition=None)
+    assert {(c.method, c.n_calibration) for c in chosen} == {("prior", 0), ("MLP", 50)}
+    with pytest.raises(SystemExit, match=r"expected task among .*linear_gaussian"):
+        suite.select(task=["sir"])
+    with pytest.raises(SystemExit, match=r"No suite 'nonsense'; there are .*smoke"):
+        load_suite("nonsense")
+
+
+def test_the_suites_that_come_along_can_be_read_and_smoke_has_every_method() -> None:
+    for suite in map(load_suite, list_suites()):
+        assert {cell.preset for cell in suite.cells} <= {*PRESETS}
+        assert {cell.task for cell in suite.cells} <= {*list_tasks()}
+    cells = load_suite("smoke").cells
+    # As many as continuous integration expects.
+    assert f"\nexpected={len(cells)} " in (ROOT / ".ci" / "run").read_text()
+    slow = {"RNPE", "HVAE"}
+    assert {cell.method for cell in cells} == {*METHODS} - slow - {"stack, given prior"}
+    # No two are drawn alike.
+    assert len({entry.style for entry in METHODS.values()}) == len(METHODS)
+
+
+@pytest.mark.parametrize("name", list_tasks())
+def test_every_preset_builds_an_estimator_for_every_task(name: str) -> None:
+    task = get_task(name)
+    theta, x = task.get_prior().sample((8,)), torch.randn(8, *task.x_shape)
+    for preset, settings_of in PRESETS.items():
+        if preset == "paper" and task.paper_settings is None:
+            with pytest.raises(ValueError, match="not in the paper"):
+                settings_of(task)
+            continue
+        estimator = settings_of(task).builder(task)(theta, x)
+        assert estimator.log_prob(theta[None], condition=x).shape == (1, 8)
+
+
+# Results ----------------------------------------------------------------------------
+
+
+def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "file.txt"
+    path.write_text("old")
+
+    def interrupted() -> None:
+        with write_atomically(path) as temporary:
+            temporary.write_text("ne")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_results_survive_being_written_and_read(tmp_path: Path) -> None:
+    results = Results(tmp_path / "tiny")
+    assert len(results.rows) == 0
+    results.add([result_of(CELLS[1], 1 / 3), result_of(CELLS[2], "failed")])
+    results.add([result_of(CELLS[0], -math.inf)])
+    before = results.path.read_text().splitlines()
+    results.sort(CELLS)
+    after = results.path.read_text().splitlines()
+    rows = results.rows
+    assert [*rows.index] == CELLS
+    assert rows["lpp_z"].iloc[:2].tolist() == [-math.inf, 1 / 3]
+    assert rows["error"].tolist() == ["", "", "ValueError: no"]
+    # To the letter, in another order.
+    assert sorted(before) == sorted(after)
+    assert before != after
+    with np.load(results.folder / "arrays" / f"{CELLS[1].key}.npz") as arrays:
+        assert arrays["log_probs"].tolist() == [1 / 3] * 3
+    # A later result of a cell takes the place of the earlier one.
+    results.add([result_of(CELLS[2], -1.0)])
+    assert results.rows["lpp_z"].tolist() == [-math.inf, 1 / 3, -1.0]
+
+
+def test_rows_of_another_suite_are_taken_over(tmp_path: Path) -> None:
+    first, second = Results(tmp_path / "first"), Results(tmp_path / "second")
+    first.add(result_of(cell, -1.0) for cell in CELLS)
+    second.add([result_of(CELLS[1], -2.0)])
+    second.take_over(CELLS[:2])
+    assert second.rows["lpp_z"].to_dict() == {CELLS[1]: -2.0, CELLS[0]: -1.0}
+    assert {*second.rows["suite"]} == {"second"}
+
+
+@pytest.mark.medium
+def test_a_suite_is_drawn_with_failures_and_what_is_not_finite(
+    suite: Suite, tmp_path: Path
 ) -> None:
-    suite = load_suite("smoke")
-    Results(tmp_path / "smoke").add(
-        [result_of(suite.cells[0], -1.0), result_of(suite.cells[1], "failed")]
-    )
-    assert main(["status", "--out", str(tmp_path)]) == 0
-    total = len(suite.cells)
-    printed = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert ["smoke", str(total), "1", "1", str(total - 2)] in printed
+    scores = {"prior": -math.inf, "MLP": "failed", "OT-only": -2.0, "RoPE": -1.0}
+    results = Results(tmp_path / "tiny")
+    draw_suite(suite, results.rows, results.folder)  # without a result there is nothing
+    results.add(result_of(cell, scores[cell.method]) for cell in suite.cells)
+    draw_suite(suite, results.rows, results.folder)
+    assert [path.name for path in results.folder.glob("*.png")] == ["n_calibration.png"]
+
+
+# Runs -------------------------------------------------------------------------------
 
 
 @pytest.mark.medium
@@ -100,12 +217,10 @@ def test_people_of_the_simulator_are_the_real_ones_where_it_is_right(
 
 @pytest.mark.medium
 def test_only_what_another_version_has_made_is_computed_again(
-    suite_file: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    command = ["run", suite_file, "--out", str(tmp_path), "--method"]
+    assert all((ROOT / path).exists() for path in runner.CODE)
+    command = ["run", written(SMALL, tmp_path), "--out", str(tmp_path), "--method"]
     path = tmp_path / "tiny" / "results.csv"
     monkeypatch.setattr(runner, "code_version", lambda: "aaaaaaa")
     main([*command, "prior"])
@@ -119,97 +234,34 @@ def test_only_what_another_version_has_made_is_computed_again(
         main([*command, "prior", "NPE", "--again"])
         assert count in capsys.readouterr().out
     assert {*Results(path.parent).rows["git_commit"]} == {"bbbbbbb"}
-    # Of changed code, too.
-    monkeypatch.setattr(runner, "code_version", lambda: "bbbbbbb+")
-    for _ in range(2):
-        main([*command, "prior", "--again"])
-        assert "0 kept, 1 finished" in capsys.readouterr().out
-
-
-def test_results_and_pages_make_no_other_version_of_the_code(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def git(*args: str) -> None:
-        user = ("-c", "user.name=a", "-c", "user.email=a@b.c")
-        subprocess.run(("git", *user, *args), cwd=tmp_path, check=True)
-
-    assert all((ROOT / path).exists() for path in runner.CODE)
-    monkeypatch.setattr(runner, "ROOT", tmp_path)
-    git("init", "-q")
-    versions = []
-    for name in ("sbi_rope/a.py", "benchmarks/results.csv", "benchmarks/cases.py"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_text("1")
-        git("add", ".")
-        git("commit", "-q", "-m", "-")
-        versions.append(code_version())
-    assert versions[0] == versions[1] != versions[2]
-    (tmp_path / "benchmarks" / "results.csv").write_text("2")
-    assert code_version() == versions[2]
-    (tmp_path / "sbi_rope" / "a.py").write_text("2")
-    assert code_version() == f"{versions[2]}+"
-
-
-@pytest.mark.slow
-def test_a_killed_run_resumes_to_the_table_of_one_that_was_not(
-    suite_file: str, tmp_path: Path
-) -> None:
-    assert main(["run", suite_file, "--out", str(tmp_path / "whole")]) == 0
-    whole = rows_of(tmp_path / "whole")
-    assert len(whole) == 7
-    command = [sys.executable, "-m", "benchmarks", "run", suite_file, "--jobs", "2"]
-    command += ["--out", str(tmp_path)]
-    with (tmp_path / "output").open("w") as output:
-        process = subprocess.Popen(command, cwd=ROOT, stdout=output, stderr=output)
-    results = Results(tmp_path / "tiny")
-    while len(results.rows) < 2:
-        assert process.poll() is None, (tmp_path / "output").read_text()
-        time.sleep(0.05)
-    process.kill()
-    process.wait()
-    kept = len(results.rows)
-    assert 2 <= kept < len(whole)
-    again = subprocess.run(
-        command, cwd=ROOT, check=True, capture_output=True, text=True
-    )
-    assert f"{kept} kept, {len(whole) - kept} finished" in again.stdout
-    assert rows_of(tmp_path) == whole
 
 
 @pytest.mark.medium
 def test_a_failing_method_does_not_stop_the_others_and_is_no_success(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    suite = tmp_path / "failing.toml"
+    command = ["run", written(SMALL, tmp_path), "--out", str(tmp_path), "--method"]
     # HVAE needs a differentiable simulator, which this task has not.
-    suite.write_text(
-        'preset = "smoke"\nrepetitions = 1\n[[cells]]\ntasks = ["sir"]\n'
-        'methods = ["HVAE", "prior"]\nn_calibration = [10]\n'
-    )
-    command = ["run", str(suite), "--out", str(tmp_path / "out")]
     for more, counts in (
         ([], "0 kept, 1 finished, 1 failed"),
         ([], "2 kept, 0 finished, 0 failed"),
         (["--retry"], "1 kept, 0 finished, 1 failed"),
     ):
-        assert main([*command, *more]) == 1
+        assert main([*command, "HVAE", "prior", *more]) == 1
         printed = capsys.readouterr().out
         assert counts in printed
         assert "failed: sir HVAE n_c=10 #0: " in printed
-    rows = Results(tmp_path / "out" / "failing").rows
-    assert {*rows["git_commit"]} == {code_version()}
-    assert main([*command, "--method", "prior"]) == 0
+    assert main([*command, "prior"]) == 0
 
 
 def test_methods_see_the_same_data_and_repetitions_do_not(tmp_path: Path) -> None:
-    cell = Cell(task="linear_gaussian", preset="smoke", method="NPE", n_calibration=10)
     first, same, other, shifted = (
-        Case(one, Workplace(tmp_path))
-        for one in (
-            cell,
-            replace(cell, method="RoPE", gamma=0.1, tau=1.0),
-            replace(cell, repetition=1),
-            replace(cell, variant="prior_shift"),
+        smoke_case("linear_gaussian", tmp_path, **fields)
+        for fields in (
+            {},
+            {"method": "RoPE", **COUPLING},
+            {"repetition": 1},
+            {"variant": "prior_shift"},
         )
     )
     for name in ("simulations", "calibration", "test_set"):
@@ -220,40 +272,9 @@ def test_methods_see_the_same_data_and_repetitions_do_not(tmp_path: Path) -> Non
         assert torch.equal(ours, theirs)
         assert not torch.equal(ours, others)
     # A variant of the real process has the same simulations, and shares the NPE.
-    assert torch.equal(first.simulations[1], shifted.simulations[1])
     assert not torch.equal(first.test_set[1], shifted.test_set[1])
-    theta, x = first.test_set
-    ours, theirs = (
-        case.npe.log_prob_batched(theta[None], x) for case in (first, shifted)
-    )
-    assert torch.equal(ours, theirs)
+    _ = first.npe, shifted.npe
     assert len(list((tmp_path / "cache").glob("npe-*.pt"))) == 1
-
-
-class Thief:
-    """Runs code when it is unpickled."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return Path.write_text, (self.path, "code was run")
-
-
-def test_reading_what_cells_share_runs_no_code(tmp_path: Path) -> None:
-    assert smoke_case("linear_gaussian", tmp_path).npe is not None
-    for path in (tmp_path / "cache").glob("*.pt"):
-        kept = path.read_bytes()
-        torch.save(Thief(tmp_path / "proof"), path)
-        with pytest.raises(Exception, match=r"could run anything|Weights only load"):
-            _ = smoke_case("linear_gaussian", tmp_path).npe
-        path.write_bytes(kept)
-    assert not (tmp_path / "proof").exists()
-
-
-def smoke_case(task: str, folder: Path, **fields: Any) -> Case:
-    fields = {"method": "NPE", "n_calibration": 10} | fields
-    return Case(Cell(task=task, preset="smoke", **fields), Workplace(folder))
 
 
 def test_entries_say_which_methods_see_calibration_pairs_and_observations(
@@ -261,18 +282,16 @@ def test_entries_say_which_methods_see_calibration_pairs_and_observations(
 ) -> None:
     case = smoke_case("pendulum", tmp_path)
     for name, entry in METHODS.items():
-        if entry.couples or name in STACKS:
-            assert entry.build is None
+        if entry.build is None:
+            assert entry.couples or name in STACKS
             continue
-        assert entry.build is not None
         sees = entry.build(case).sees
         assert ("calibration" in sees) == entry.pairs, name
         assert ("observations" in sees) == entry.observations, name
 
 
 def test_the_row_of_ot_only_is_that_of_the_method_of_its_name(tmp_path: Path) -> None:
-    coupling = {"gamma": 0.1, "tau": 1.0, "cost_scale": "simulated"}
-    case = smoke_case("linear_gaussian", tmp_path, method="OT-only", **coupling)
+    case = smoke_case("linear_gaussian", tmp_path, method="OT-only", **COUPLING)
     (result,) = score(case, [case.cell])
     method = OTOnly.from_posterior(
         case.npe,
@@ -285,22 +304,3 @@ def test_the_row_of_ot_only_is_that_of_the_method_of_its_name(tmp_path: Path) ->
         case.test_set[0][None], case.test_set[1]
     )
     assert np.array_equal(ours[0].numpy(), result.arrays["log_probs"])
-
-
-@pytest.mark.slow
-def test_what_is_fine_tuned_is_a_discrepancy_of_x_itself_where_it_is_short(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("benchmarks.methods.NUM_HOLDOUTS", 2)
-    build = METHODS["discrepancy, fine-tuned"].build
-    assert build is not None
-    method: Any = build(smoke_case("pendulum", tmp_path / "long"))
-    assert method.space == "embedding"
-    case = smoke_case("linear_gaussian", tmp_path / "short")
-    method = build(case)
-    assert method.space == "input"
-    method.append_calibration(*case.calibration)
-    method.train(seed=0, show_progress_bars=False)
-    assert method.build_posterior().posterior_estimator.num_members == 2
-    # The corrected NPE is the start: the discrepancy was fitted, too.
-    assert method.discrepancy.num_independent == 10

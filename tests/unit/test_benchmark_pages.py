@@ -2,18 +2,15 @@
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-import pandas as pd
 import pytest
 
-from benchmarks.cells import Cell
 from benchmarks.figures import draw_overview
 from benchmarks.pages import BLOCK, BLOCKS, pages_with_blocks, write_pages
-from benchmarks.published import FIXED, PAPER, Published, relative_ranks
-from benchmarks.store import Result, Results
+from benchmarks.published import FIXED, PAPER, Published
+from benchmarks.store import Results
 from benchmarks.suites import load_suite
 from tests.results import result_of
 
@@ -21,32 +18,22 @@ pytestmark = pytest.mark.usefixtures("rough_pictures")
 
 ROOT = Path(__file__).parents[2]
 COMMITTED = ROOT / "benchmarks" / "results"
-# A cell to its LPP, or None if it was not run, or "failed".
-Scores = Callable[[Cell], float | str | None]
 
 
-def published(folder: Path, scores: Scores) -> Published:
-    """Make up the results of `main`."""
-    made = {cell: scores(cell) for cell in load_suite("main").cells}
-    Results(folder / "main").add(
-        result_of(cell, score, 0.02)
-        for cell, score in made.items()
-        if score is not None
-    )
+def published(folder: Path, task: str, runs: list[dict[str, Any]]) -> Published:
+    """Make up results of `main` on a task, by repetition.
+
+    Methods have an LPP, "failed", or None if they were not run; -5 if nothing is said.
+    """
+    results = []
+    for cell in load_suite("main").cells:
+        if cell.task == task and cell.repetition < len(runs):
+            other = (cell.gamma, cell.tau, cell.cost_scale) != FIXED
+            name = f"{cell.method}, other" if cell.gamma and other else cell.method
+            score = runs[cell.repetition].get(name, -5.0)
+            results += [] if score is None else [result_of(cell, score, 0.02)]
+    Results(folder / "main").add(results)
     return Published.read(folder)
-
-
-def on(task: str, by_repetition: Sequence[Mapping[str, float | str | None]]) -> Scores:
-    """Scores of methods on a task by repetition; -5 if nothing is said."""
-
-    def scores(cell: Cell) -> float | str | None:
-        if cell.task != task or cell.repetition >= len(by_repetition):
-            return None
-        other = (cell.gamma, cell.tau, cell.cost_scale) != FIXED
-        name = f"{cell.method}, other" if cell.gamma and other else cell.method
-        return by_repetition[cell.repetition].get(name, -5.0)
-
-    return scores
 
 
 def line(lines: list[str], start: str) -> list[str]:
@@ -70,33 +57,17 @@ def test_committed_pages_are_those_of_the_tables(tmp_path: Path) -> None:
     assert {*re.findall(r"<!-- results: ([\w-]+) -->", texts)} == {*BLOCKS}
 
 
-def test_only_places_that_are_whole_and_known_are_written(tmp_path: Path) -> None:
-    results = published(tmp_path, on("cs", [{}]))
-    page = tmp_path / "page.md"
-    begin, end = "<!-- results: costs -->\n", "<!-- /results -->\n"
-    for text in (begin + begin + end, begin.replace("costs", "unheard-of") + end):
-        page.write_text(text)
-        with pytest.raises(SystemExit, match=r"page\.md: expected places"):
-            write_pages(results, [page])
-        assert page.read_text() == text
-    page.write_text(f"before\n{begin}old\n{end}after\n")
-    write_pages(results, [page])
-    whole = rf"before\n{begin}\|((?!old).)*\|\n{end}after\n"
-    assert re.fullmatch(whole, page.read_text(), re.DOTALL)
-
-
 @pytest.mark.medium
 def test_the_stack_is_compared_with_the_best_other(tmp_path: Path) -> None:
     lpps = -1.0, -1.2, -1.1
     ours = [{"stack": lpp, "J-NPE": -1.5} for lpp in lpps]
-    results = published(tmp_path, on("cs", ours))
+    results = published(tmp_path, "cs", ours)
     assert BLOCKS["goals"](results)[3].endswith("over repetitions: 3 of 3")
     # Nothing is lost anywhere.
     assert len(BLOCKS["not-the-best"](results)) == 2
     theirs = [{"stack": -1.5, "J-NPE": lpp} for lpp in lpps]
-    row = line(
-        BLOCKS["not-the-best"](published(tmp_path, on("cs", theirs))), "A cs | 50"
-    )
+    lines = BLOCKS["not-the-best"](published(tmp_path, "cs", theirs))
+    row = line(lines, "A cs | 50")
     # 4.303 is Student's quantile of two degrees of freedom.
     gap = f"-0.40 ± {4.303 * 0.1 / 3**0.5:.2f}"
     assert row[1:] == ["3", "-1.50", "+0.020", "J-NPE", "-1.10", gap]
@@ -104,55 +75,14 @@ def test_the_stack_is_compared_with_the_best_other(tmp_path: Path) -> None:
 
 def test_methods_that_see_more_or_are_ours_are_counted_apart(tmp_path: Path) -> None:
     lpp = {"stack": -1.0, "RVNP": -0.5, "discrepancy": -1.0, "J-NPE": -1.5, "NPE": -0.8}
-    goals = BLOCKS["goals"](published(tmp_path, on("cs", [lpp, lpp])))
+    goals = BLOCKS["goals"](published(tmp_path, "cs", [lpp, lpp]))
     assert [goal.split(": ")[-1] for goal in goals[1:6]] == ["0 of 3"] * 5
     assert "|ACAUC| of 0.020" in goals[6]
     lpp |= {"RVNP": -1.5, "NPE": -1.5}
-    goals = BLOCKS["goals"](published(tmp_path, on("cs", [lpp, lpp])))
+    goals = BLOCKS["goals"](published(tmp_path, "cs", [lpp, lpp]))
     counts = [goal.split(": ")[-1] for goal in goals[1:6]]
     # A candidate of ours is as good, so that the stack is above all others only.
     assert counts == ["3 of 3", "3 of 3", "0 of 3", "3 of 3", "3 of 3"]
-
-
-def test_a_stack_is_compared_with_its_best_candidate(tmp_path: Path) -> None:
-    cell = Cell(task="pendulum", method="stack", n_calibration=10)
-    scores = {"best_candidate": -1.15, "best_basic": -3.0}
-    row, _ = result_of(cell, -1.2)
-    far = {"held_out": -1.7, "held_out_error": 0.2}
-    near = {"held_out": -1.5, "held_out_error": 0.2, "best_candidate": -1.0}
-    Results(tmp_path / "stacking").add(
-        [
-            Result(row | scores | far, {}),
-            Result(row | scores | near | {"repetition": 1}, {}),
-        ]
-    )
-    counts = line(BLOCKS["candidates"](Published.read(tmp_path)), "10")
-    assert counts == ["2", "1", "2", "1"]
-
-
-@pytest.mark.medium
-def test_ranks_are_relative_to_what_was_run_and_a_failure_is_the_last() -> None:
-    scores = {"stack": -1.0, "NPE": -2.0, "RoPE": None, "J-NPE": -1.5}
-    rows = pd.DataFrame(
-        {"method": name, "task": task, "repetition": 0, "lpp_z": score}
-        for task in ("cs", "sir")
-        for name, score in scores.items()
-        if (task, name) != ("sir", "J-NPE")
-    ).assign(n_calibration=50)
-    rows["status"] = np.where(rows["lpp_z"].isna(), "failed", "finished")
-    ranks = relative_ranks(rows, beside="stack")
-    expected = {"stack": 0.0, "J-NPE": 1 / 3, "NPE": 2 / 3, "RoPE": 1.0}
-    assert ranks["cs"].to_dict() == pytest.approx(expected)
-    assert ranks["sir"].drop("J-NPE").to_dict() == {"stack": 0, "NPE": 0.5, "RoPE": 1}
-    assert math.isnan(ranks["sir"]["J-NPE"])
-    assert relative_ranks(rows.assign(n_calibration=1000), beside="stack").empty
-
-
-@pytest.mark.medium
-def test_the_pictures_of_all_tasks_are_drawn(tmp_path: Path) -> None:
-    draw_overview(published(tmp_path, on("cs", [{"stack": -1.0}])))
-    drawn = {path.name for path in tmp_path.glob("*.png")}
-    assert drawn == {"methods.png", "ranks.png"}
 
 
 @pytest.mark.medium
@@ -160,7 +90,7 @@ def test_the_best_has_all_repetitions_and_the_fixed_setting(tmp_path: Path) -> N
     usual = {"NPE": -1.0, "SBI": 0.0, "RoPE": -2.0, "RoPE, other": -0.5}
     first = usual | {"MLP": -0.1, "prior": -math.inf, "NNPE": None}
     runs = [first, usual | {"MLP": -0.1}, usual | {"MLP": "failed"}]
-    lines = BLOCKS["lpp"](published(tmp_path, on("cs", runs)))
+    lines = BLOCKS["lpp"](published(tmp_path, "cs", runs))
     assert line(lines, "NPE") == ["**-1.00 ± 0.00**"]
     assert line(lines, "MLP") == ["-0.10 ± 0.00 (1 of 3 failed)"]
     assert line(lines, "NNPE") == ["-5.00 ± 0.00 [2]"]
@@ -177,7 +107,7 @@ def test_readme_shows_scores_with_their_intervals(tmp_path: Path) -> None:
         {"stack": -1.2, "RoPE": None, fmcpe: -6.0},
         {"stack": -1.1, "RoPE": None, fmcpe: "failed"},
     ]
-    lines = BLOCKS["readme"](published(tmp_path, on("light_tunnel_sensors", runs)))
+    lines = BLOCKS["readme"](published(tmp_path, "light_tunnel_sensors", runs))
     stack = "-1.10 ± 0.25 (3)"  # 4.303 * 0.1 / sqrt(3)
     assert line(lines, "**`stack`**") == [stack, stack, stack, "+0.020"]
     # Of one repetition the interval is over its test observations.
@@ -185,8 +115,19 @@ def test_readme_shows_scores_with_their_intervals(tmp_path: Path) -> None:
     assert line(lines, fmcpe)[0] == "-6.00 ± 0.00 (2; 1 failed)"
 
 
-def test_what_was_run_is_counted(tmp_path: Path) -> None:
-    lines = BLOCKS["what-was-run"](published(tmp_path, on("cs", [{"MLP": "failed"}])))
+@pytest.mark.medium
+def test_what_was_run_is_drawn_and_counted_on_a_page(tmp_path: Path) -> None:
+    results = published(tmp_path, "cs", [{"MLP": "failed"}])
+    draw_overview(results)
+    drawn = {path.name for path in tmp_path.glob("*.png")}
+    assert drawn == {"methods.png", "ranks.png"}
+    page = tmp_path / "page.md"
+    begin, end = "<!-- results: what-was-run -->\n", "<!-- /results -->\n"
+    page.write_text(f"before\n{begin}old\n{end}after\n")
+    write_pages(results, [page])
+    lines = page.read_text().splitlines()
+    assert (lines[0], lines[-1]) == ("before", "after")
+    assert "old" not in lines
     finished, failed, missing = line(lines, "[main](main/n_calibration.png)")
     assert failed == "4: MLP 4"
     assert " ocean_colour " in missing
