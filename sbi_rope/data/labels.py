@@ -41,9 +41,6 @@ FREEDOM, JITTER = 5.0, 1e-6
 Moments = tuple[Tensor, Tensor]
 
 
-# What users pass ----------------------------------------------------------------------
-
-
 def given_labels(
     theta: Any,
     theta_std: Any,
@@ -109,9 +106,6 @@ def given_groups(groups: Any, n: int) -> tuple[Hashable, ...]:
     return names
 
 
-# Draws of parameters ------------------------------------------------------------------
-
-
 def draws_of(pairs: Pairs, prior: PriorDistribution) -> Tensor:
     r"""Draw from :math:`p(\theta \mid y) \propto p(\theta)\, p(y \mid \theta)`.
 
@@ -157,9 +151,6 @@ def _systematic(shares: Tensor, count: int) -> Tensor:
     # In random order, so that any part of the draws represents all of them.
     shuffled = torch.rand(len(shares), count).argsort(dim=1).to(shares.device)
     return order.gather(1, shuffled).clamp_max(shares.shape[1] - 1)
-
-
-# Densities of labels ------------------------------------------------------------------
 
 
 def nodes_of(

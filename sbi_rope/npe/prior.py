@@ -54,8 +54,6 @@ class PriorDistribution(Distribution):
         self._own = move_distribution_to_device(self._own, device)
         self._some = self._some.to(device)
 
-    # --- draws and density ---
-
     def sample(self, sample_shape: Any = ()) -> Tensor:
         """Draw parameters, shape ``(*sample_shape, d)``."""
         # sbi's MultipleIndependent takes sample shapes with one dimension only.
@@ -87,8 +85,6 @@ class PriorDistribution(Distribution):
         """Return theta ``(n, d)``, rows outside replaced, and which were inside."""
         inside = self.inside(theta)
         return theta.where(inside[:, None], self._some.to(theta)), inside
-
-    # --- bounds ---
 
     @property
     def support(self) -> Any:
@@ -124,8 +120,6 @@ class PriorDistribution(Distribution):
         inside = theta.clamp(low.nextafter(high), high.nextafter(low))
         is_discrete = _entries(self._support, theta, "is_discrete", 0.0) > 0
         return theta.where(is_discrete, inside)
-
-    # --- units ---
 
     @property
     def mean(self) -> Tensor:
