@@ -99,10 +99,8 @@ class _Linear(_Stacked):
         if mask is not None:
             weight = weight * mask
         rows = x.reshape(len(weight), -1, x.shape[-1])
-        if bias:
-            y = torch.baddbmm(bias[0][:, None], rows, weight.mT)
-        else:
-            y = rows @ weight.mT
+        args = rows, weight.mT
+        y = torch.baddbmm(bias[0][:, None], *args) if bias else torch.bmm(*args)
         return y.reshape(*x.shape[:-1], weight.shape[1])
 
 
@@ -175,26 +173,19 @@ STACKED: dict[type[nn.Module], type[_Stacked]] = {
 
 
 class Ensemble(nn.Module):
-    """E networks of one architecture, in evaluation mode.
+    """Copies of networks that differ in parameters only, in evaluation mode.
 
     Args:
-        members: The networks; they are copied. The same one may appear several times.
+        members: The networks. The same one may appear several times.
         question: What the network will be asked, such as :func:`log_density`.
         example: Rows to ask it. A network that mixes up the rows of members, such as
             one that puts another dimension first, is looped over as a whole.
     """
 
     def __init__(
-        self,
-        members: Sequence[nn.Module],
-        question: Question,
-        example: Sequence[Tensor],
+        self, members: Sequence[nn.Module], question: Question, example: Sequence[Any]
     ) -> None:
         super().__init__()
-        first, *others = (list(member.buffers()) for member in members)
-        for buffers in others:  # such as means and deviations by which x is divided
-            if not all(map(torch.equal, first, buffers)):
-                raise ValueError("Expected members that differ in parameters only.")
         self.num_members = len(members)
         self.net = _stacked(members)
         is_one = len(members) == 1 or not list(self.parameters())

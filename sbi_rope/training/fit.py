@@ -123,17 +123,12 @@ def fit(
             for an ensemble has the rows of member e at ``part[e]``.
         loss: Of a batch, the mean loss of each member, ``(E,)``, or of the module.
             Members that have stopped are not in the batch and in the network any more.
-        training: Learning rate and so on; ``batches`` has the size of the batches.
-        validation_loss: The loss over the hold-out set, if there is one.
-        held_out: The batch that ``validation_loss`` is called with.
+        validation_loss: The loss of ``held_out``, if there is a hold-out set.
         courses: Whether ``max_num_epochs`` are a course that others may follow, after
             which the validation loss is computed.
-        learning_rates: One for each member; that of ``training`` if None.
-        max_num_epochs: Instead of that of ``training``.
+        learning_rates: One for each member, instead of that of ``training``.
         in_training_mode: Whether dropout and batch statistics are active in training.
         decay: Whether the step size falls to zero, along a cosine over all epochs.
-        label: What the progress bar and warnings call it.
-        show_progress_bars: Whether to show the course of the loss.
     """
     if not any(parameter.requires_grad for parameter in network.parameters()):
         network.requires_grad_()
