@@ -10,7 +10,7 @@ from torch import Tensor
 from sbi_rope import RoPE
 from sbi_rope.methods import FinetunedNPE
 from sbi_rope.methods.training import Training
-from sbi_rope.metrics import draw_samples, evaluate
+from sbi_rope.metrics import evaluate
 from tests import gaussian, problems
 from tests.stacks import NPE, PRIOR, QUICK, QUIET, problem, stacked
 
@@ -35,12 +35,10 @@ def test_pairs_and_observations_are_those_of_tensors(convert: Any) -> None:
     log_prob = posterior.log_prob_batched(theta_o, x=x_o)
     assert torch.allclose(log_prob.float(), posterior.log_prob_batched(*OBSERVED))
     assert posterior.sample((3,), x=x_o[1]).shape == (3, 2)
-    assert posterior.sample_batched((3,), x=x_o, **QUIET).shape == (3, 25, 2)
     for scored in (posterior, npe):
         scores = evaluate(scored, theta_o, x_o, num_samples=20, seed=0, **QUIET)
         expected = evaluate(scored, *OBSERVED, num_samples=20, seed=0, **QUIET)
         assert scores.as_row() == pytest.approx(expected.as_row(), nan_ok=True)
-        assert draw_samples(scored, x_o, num_samples=3).shape == (3, 25, 2)
 
 
 @pytest.mark.medium

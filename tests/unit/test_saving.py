@@ -15,39 +15,18 @@ import torch
 from sbi.inference import VIPosterior
 from torch import Tensor, nn
 
-from sbi_rope import MixturePosterior, StackedPosterior, load, save
+from sbi_rope import MixturePosterior, load, save
 from sbi_rope.density import Flow, PriorPosterior
 from sbi_rope.stacking import DiscrepancyCandidate, FinetunedCandidate
 from sbi_rope.tasks.distributions import UniformTriangle
 from sbi_rope.tasks.hemodynamics.prior import PopulationPrior
 from sbi_rope.utils.errors import DataNotFoundError, FileFormatError
 from tests import problems, stacks
-from tests.baselines import data_of, trained
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*lie outside the prior support")
 
 QUIET = {"show_progress_bars": False}
 ROOT = Path(__file__).resolve().parents[2]
-
-
-def mixture_of(posterior: Any) -> MixturePosterior:
-    """Return a mixture of one part, for any x."""
-    estimator = Flow.of([posterior.posterior_estimator])
-    return MixturePosterior(estimator, posterior.prior)
-
-
-def rope_posterior(**options: Any) -> MixturePosterior:
-    rope = stacks.rope_of().train(seed=0, **QUIET)
-    return rope.build_posterior(stacks.observed(), seed=0, **options, **QUIET)
-
-
-@functools.cache
-def small_stack() -> StackedPosterior:
-    """Return a stack of few candidates, for reading only."""
-    trained_ones = (DiscrepancyCandidate(space="tuned"), FinetunedCandidate())
-    candidates = [stacks.PRIOR, stacks.NPE, *trained_ones, stacks.BOX]
-    with torch.random.fork_rng():
-        return stacks.stacked(stacks.rope_of(), candidates=candidates, num_folds=3)
 
 
 def numbers(posterior: Any, x: Tensor, *, truncated: bool = True) -> list[Tensor]:
@@ -74,9 +53,6 @@ def assert_same(posterior: Any, loaded: Any, x: Tensor, **options: Any) -> None:
     assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
 
 
-# --- what is loaded is what was saved ---
-
-
 FRESH = """
 import pathlib, sys, torch, sbi_rope
 for file in sorted(pathlib.Path(sys.argv[1]).glob("*.pt")):
@@ -93,16 +69,12 @@ assert not [name for name in sys.modules if name.split(".")[0] == "tests"]
 
 @pytest.mark.medium
 def test_another_process_loads_the_same_posteriors(tmp_path: Path) -> None:
-    batch, stack = rope_posterior(), small_stack()
-    tuned = trained("finetuned_npe_averaged", "linear_gaussian").build_posterior()
-    x_o = stacks.observed()
-    cases = [
-        (batch, x_o[:5]),
-        (batch[3], x_o[3:4]),
-        (stack, x_o[:4]),
-        (tuned, data_of("linear_gaussian").x_o[:3]),
-        (PriorPosterior(problems.box(2)), x_o[:2]),
-    ]
+    x_o, rope = stacks.observed(), stacks.rope_of().train(seed=0, **QUIET)
+    batch = rope.build_posterior(x_o, seed=0, **QUIET)
+    candidates = [stacks.PRIOR, stacks.NPE, stacks.BOX]
+    candidates += [DiscrepancyCandidate(space="tuned"), FinetunedCandidate()]
+    stack = stacks.stacked(rope, candidates=candidates, num_folds=3)
+    cases = [(batch, x_o[:5]), (batch[3], x_o[3:4]), (stack, x_o[:4])]
     for number, (posterior, x) in enumerate(cases):
         save(posterior, tmp_path / f"{number}.pt")
         torch.save((x, *numbers(posterior, x)), tmp_path / f"{number}.expected")
@@ -123,7 +95,8 @@ def test_another_process_loads_the_same_posteriors(tmp_path: Path) -> None:
 def test_every_family_can_be_saved(family: str, tmp_path: Path) -> None:
     npe = problems.npe_posterior(family)
     x = problems.simulate(npe.prior.sample((3,)))
-    for posterior in (npe, mixture_of(npe)):
+    mixture = MixturePosterior(Flow.of([npe.posterior_estimator]), npe.prior)
+    for posterior in (npe, mixture):
         # The mass inside the prior takes draws, which some families search for.
         loaded = saved_and_loaded(posterior, tmp_path)
         assert_same(posterior, loaded, x, truncated=False)
@@ -138,16 +111,11 @@ def test_posteriors_of_vector_fields_can_be_saved(method: str, tmp_path: Path) -
     assert_same(posterior, loaded, problems.simulate(torch.zeros(1, 2)))
 
 
-@pytest.mark.parametrize(
-    "prior", [UniformTriangle(torch.tensor(0.5)), PopulationPrior()]
-)
-def test_priors_can_be_saved(prior: Any, tmp_path: Path) -> None:
-    posterior = PriorPosterior(prior)
-    loaded = saved_and_loaded(posterior, tmp_path)
-    assert_same(posterior, loaded, torch.zeros(2, 3))
-
-
-# --- what is refused ---
+def test_priors_can_be_saved(tmp_path: Path) -> None:
+    for prior in (UniformTriangle(torch.tensor(0.5)), PopulationPrior()):
+        posterior = PriorPosterior(prior)
+        loaded = saved_and_loaded(posterior, tmp_path)
+        assert_same(posterior, loaded, torch.zeros(2, 3))
 
 
 class Calls:
@@ -160,17 +128,13 @@ class Calls:
         return self.call
 
 
-def touch(path: Path) -> Calls:
-    return Calls(os.system, f"touch {path}")
-
-
 @pytest.mark.parametrize("write", [pickle.dump, torch.save])
 def test_a_malicious_pickle_is_refused_and_not_executed(
     write: Callable[..., Any], tmp_path: Path
 ) -> None:
     path, target = tmp_path / "posterior.pt", tmp_path / "executed"
     with path.open("wb") as file:
-        write(touch(target), file)
+        write(Calls(os.system, f"touch {target}"), file)
     with pytest.raises(FileFormatError):
         load(path)
     assert not target.exists()
@@ -182,12 +146,10 @@ def test_a_malicious_pickle_is_refused_and_not_executed(
         Calls(eval, "print()"),
         Calls(functools.partial, eval, "print()"),
         Calls(getattr, nn.Linear(1, 1), "forward"),
-        Calls(importlib.import_module, "antigravity"),
         Calls(torch.load, "file"),
         # What is only named may be called by what is known.
         os.system,
         importlib.import_module,
-        torch.distributions.kl_divergence,
         VIPosterior,
         save,
     ],
@@ -221,9 +183,6 @@ def test_classes_of_the_user_have_to_be_trusted(tmp_path: Path) -> None:
     assert type(loaded.net) is OwnNet
     assert loaded.net(torch.ones(1)).item() == 2
     assert loaded.function is problems.simulate
-
-
-# --- files ---
 
 
 def test_a_file_is_replaced_only_when_asked_to(tmp_path: Path) -> None:
