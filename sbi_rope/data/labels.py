@@ -5,10 +5,9 @@ The density of a label y given x averages a posterior over what the label leaves
 .. math:: p(y \mid x) = \int q(\theta \mid x)\, p(y \mid \theta)\, d\theta ,
 
 where exact parameters are fixed and :math:`p(y \mid \theta)` is one for missing ones.
-It is estimated by importance sampling from a mixture of Student t distributions, each a
-reference posterior, taken for normal and updated with the label as in a Kalman filter.
-References are the posteriors to be scored and the prior, so that no density is much
-larger than the mixture.
+It is estimated by importance sampling from a mixture of Student t distributions: the
+posteriors to be scored and the prior, each taken for normal and updated with the label
+as in a Kalman filter, so that no density is much larger than the mixture.
 """
 
 import math
@@ -158,10 +157,9 @@ def nodes_of(
 ) -> Nodes:
     r"""Return the nodes at which the densities of labels are computed.
 
-    Of labels given as draws, these are the draws, weighted by
-    :math:`1 / p(\theta)`, so that scores are relative to those of the prior. Others
-    have at least ``num_nodes``. The ``samples`` are those of each density to be scored,
-    ``(M, n, d)``, at the observation of each label.
+    Labels given as draws have these, weighted by :math:`1 / p(\theta)`, so that scores
+    are relative to those of the prior. Others have at least ``num_nodes``. The
+    ``samples`` are those of each density at the observations, ``(M, n, d)``.
     """
     if pairs.are_drawn:
         log_prior = prior.log_prob(pairs.theta).double()

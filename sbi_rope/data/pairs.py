@@ -138,8 +138,8 @@ class Pairs(Rows):
 
     def folds(self, num_folds: int, *, seed: int | None = None) -> list[Tensor]:
         """Cut rows into folds of like size at random; a group is in one fold."""
-        # scikit-learn's GroupKFold refuses fewer groups than folds, and in which order
-        # it takes groups of equal size depends on its version.
+        # scikit-learn's GroupKFold refuses fewer groups than folds, and its order of
+        # groups of equal size depends on its version.
         groups = groups_of(self.group)
         sizes = torch.bincount(groups)
         with seeded(seed):
@@ -210,9 +210,9 @@ class Nodes(Rows):
 
 
 def groups_of(values: Tensor | Sequence[Hashable]) -> Tensor:
-    """Number rows ``(n, d)``, numbers or names, so that equal ones share a number.
+    """Number rows or names by first appearance, from 0; equal ones share a number.
 
-    Numbers start at 0, in the order of first appearance, on the CPU, shape ``(n,)``.
+    Shape ``(n,)``, on the CPU.
     """
     rows = values.tolist() if isinstance(values, Tensor) else values
     keys = [tuple(row) if isinstance(row, list) else row for row in rows]
@@ -236,10 +236,7 @@ def group_means(values: Tensor, weight: Tensor, group: Tensor) -> tuple[Tensor, 
 
 
 def effective_number(weight: Tensor) -> float:
-    r"""Return the number of equal weights with the precision of these.
-
-    .. math:: \Bigl(\sum_g w_g\Bigr)^2 \Big/ \sum_g w_g^2
-    """
+    r"""Return :math:`(\sum w)^2 / \sum w^2`, as many equal weights are as precise."""
     weight = weight.double()
     return float(weight.sum().square() / weight.square().sum())
 

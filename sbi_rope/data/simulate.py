@@ -128,8 +128,7 @@ class _Way:
 class Simulated:
     """A user's simulator, called in the first way in which it returns the right shape.
 
-    Simulations that are not ``readable`` are dropped, counted and warned of. Others are
-    like the empty batch ``like``, in shape, dtype and device.
+    Simulations that are not ``readable`` are dropped, counted and warned of.
     """
 
     def __init__(
@@ -147,7 +146,6 @@ class Simulated:
         self._prior, self._like, self._readable = prior, like, readable
         self.num_dropped = self.num_calls = 0
         self._kept: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
-        # With a seed of its own, so that no result depends on it.
         with seeded(0):
             self._way = self._working_way(function)
 
@@ -180,7 +178,6 @@ class Simulated:
         )
         empty = ~ok.reshape(theta.shape[:2]).any(dim=1)
         if empty.any():
-            # Row numbers would mislead, because these may be some of the pairs only.
             raise SimulationError(
                 "All simulations at the calibration parameters "
                 f"{theta[empty].mean(dim=1)[:5].tolist()} failed. Remove these pairs."
@@ -407,10 +404,9 @@ class Moments(Rows):
 def draws(
     source: Source, pairs: Pairs, count: int, embed: Embed, *, progress: bool = False
 ) -> tuple[Tensor, Tensor]:
-    """Simulate at the draws of each pair, ``count`` times at exact parameters.
+    """Return parameters ``(n, S, d)`` and embeddings ``(n, S, l)``, S at least count.
 
-    Return parameters ``(n, S, d)`` and embeddings ``(n, S, l)``. A simulation that
-    failed is replaced by another one of the pair.
+    A simulation that failed is replaced by another one of the pair.
     """
     theta = pairs.theta.repeat(1, -(-count // pairs.theta.shape[1]), 1)
     z = source.at(theta, embed, progress=progress)

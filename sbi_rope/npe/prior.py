@@ -46,9 +46,6 @@ class PriorDistribution(Distribution):
         self._some = draws
         super().__init__(event_shape=draws.shape[1:], validate_args=False)
 
-    def __repr__(self) -> str:
-        return repr(self._own)
-
     def to(self, device: Any) -> None:
         """Move the prior to a device."""
         self._own = move_distribution_to_device(self._own, device)

@@ -133,11 +133,7 @@ class _LULinear(_Stacked):
 
 
 class _Loop(_Stacked):
-    """Any other module with parameters: each member sees its own rows.
-
-    The parameters of the members are views of the stacks also when gradients are
-    computed, because some layers evaluate their network once more then.
-    """
+    """Any other module with parameters: each member sees its own rows."""
 
     def forward(self, *rows: Any, **options: Any) -> Any:
         return self.answer(nn.Module.__call__, *rows, **options)

@@ -8,7 +8,7 @@ import warnings
 from typing import Any
 
 import pytest
-from sbi.diagnostics import check_sbc, check_tarp, run_sbc, run_tarp
+from sbi.diagnostics import check_sbc, run_sbc
 from sbi.diagnostics.sbc import check_uniformity_frequentist
 from torch import Tensor
 
@@ -65,12 +65,3 @@ def test_expected_coverage_is_nominal_for_calibrated_posteriors(
     # Uniform, with four standard errors on mean and spread.
     assert abs(float(levels.mean()) - 0.5) < 4 / (12 * NUM_OBSERVATIONS) ** 0.5
     assert 0.2 < float(levels.std()) < 0.38
-
-
-def test_tarp_accepts_calibrated_posteriors(
-    posterior: MixturePosterior, theta: Tensor
-) -> None:
-    ecp, alpha = run_tarp(theta, posterior.x_o, posterior, **OPTIONS)
-    area, p_value = check_tarp(ecp, alpha)
-    assert abs(area) < 2
-    assert p_value > 0.05

@@ -112,19 +112,6 @@ def test_the_density_of_a_label_is_that_of_the_posterior_with_its_noise() -> Non
         assert abs(float(found[i] - exact)) < (0.15 if i < 3 else 1e-6)
 
 
-@pytest.mark.parametrize("smallest", [1e-3, 1e-7])
-def test_parameters_may_be_known_with_very_different_precision(smallest: float) -> None:
-    y = torch.tensor([[0.3, -0.2]])
-    q = MultivariateNormal(torch.zeros(2).double(), 0.3 * torch.eye(2).double() + 0.1)
-    torch.manual_seed(0)
-    samples = [q.sample(torch.Size((200, 1)))]
-    nodes = nodes_of(measured(y, smallest, 0.1), samples, box(2), num_nodes=2000)
-    found = nodes.log_mean(q.log_prob(nodes.theta.double()))
-    noise = torch.tensor([smallest, 0.1]).double().square().diag()
-    exact = MultivariateNormal(q.mean, q.covariance_matrix + noise).log_prob(y.double())
-    assert abs(float(found - exact)) < 0.05
-
-
 def log_evidence(y: float, std: float) -> float:
     """Return log p(y) of the uniform prior from -1 to 1, by quadrature."""
     grid = torch.linspace(-1, 1, 20_001, dtype=torch.double)
@@ -204,24 +191,6 @@ def test_the_possible_means_are_shrunk_by_the_noise_in_them_only() -> None:
     wide = measured(theta[:, :2], 1.0, 1.0, prior=prior)
     error = moments(rope().source, wide, 100, lambda x: x).means - wide.theta.double()
     assert float(error.square().mean()) < 0.06 * gaussian.NOISE_STD**2
-
-
-@pytest.mark.medium
-def test_the_discrepancy_of_possible_means_is_that_of_the_right_ones() -> None:
-    torch.manual_seed(0)
-    m = torch.randn(60, 1, dtype=torch.double)
-    z = 0.5 * m + 2.0 + 0.05 * torch.randn(60, 1).double()
-    noise = torch.tensor([[1e-4]]).double()
-    # The right mean is one of two, and the observation tells which.
-    possible = torch.stack([m, torch.randn(60, 1).double()], dim=1)
-    found, naive = (
-        DiscrepancyModel().fit(z, means, noise).sample(500, seed=0)
-        for means in (possible, possible.mean(dim=1))
-    )
-    assert abs(float(found.gain.mean()) - 0.5) < 0.05
-    assert abs(float(found.offset.mean()) - 2.0) < 0.05
-    error = [float(one.error_factor.square().mean().sqrt()) for one in (found, naive)]
-    assert error[0] < 0.5 * error[1]
 
 
 def test_a_weight_of_two_counts_as_two_pairs() -> None:

@@ -9,14 +9,15 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 import torch
 from sbi.inference import VIPosterior
 from torch import Tensor, nn
 
-from sbi_rope import MixturePosterior, load, save
-from sbi_rope.density import Flow, PriorPosterior
+from sbi_rope import load, save
+from sbi_rope.density import PriorPosterior
 from sbi_rope.stacking import DiscrepancyCandidate, FinetunedCandidate
 from sbi_rope.tasks.distributions import UniformTriangle
 from sbi_rope.tasks.hemodynamics.prior import PopulationPrior
@@ -95,11 +96,8 @@ def test_another_process_loads_the_same_posteriors(tmp_path: Path) -> None:
 def test_every_family_can_be_saved(family: str, tmp_path: Path) -> None:
     npe = problems.npe_posterior(family)
     x = problems.simulate(npe.prior.sample((3,)))
-    mixture = MixturePosterior(Flow.of([npe.posterior_estimator]), npe.prior)
-    for posterior in (npe, mixture):
-        # The mass inside the prior takes draws, which some families search for.
-        loaded = saved_and_loaded(posterior, tmp_path)
-        assert_same(posterior, loaded, x, truncated=False)
+    # The mass inside the prior takes draws, which some families search for.
+    assert_same(npe, saved_and_loaded(npe, tmp_path), x, truncated=False)
 
 
 @pytest.mark.parametrize(
@@ -215,13 +213,7 @@ def test_damaged_and_foreign_files_are_refused(tmp_path: Path) -> None:
         torch.save(foreign, path)
         with pytest.raises(FileFormatError):
             load(path)
-
-
-def test_files_of_other_versions_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with monkeypatch.context() as patch:
-        patch.setattr("sbi.__version__", "0.1.2")
-        save(PriorPosterior(problems.box(2)), tmp_path / "x.pt")
+    with patch("sbi.__version__", "0.1.2"):
+        save(PriorPosterior(problems.box(2)), path, overwrite=True)
     with pytest.raises(FileFormatError, match=r"0\.1"):
-        load(tmp_path / "x.pt")
+        load(path)

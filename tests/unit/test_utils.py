@@ -11,10 +11,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from sbi.utils import BoxUniform
 
 from sbi_rope import RoPE, stack
-from sbi_rope.npe.prior import check_in_support
 from sbi_rope.utils.errors import InvalidInputError
 from sbi_rope.utils.progress import is_shown
 from sbi_rope.utils.seeds import seeded
@@ -33,8 +31,6 @@ from sbi_rope.utils.tensors import as_batch, as_numbers
 from tests import baselines, gaussian
 from tests.refusals import assert_refused
 from tests.stacks import BOX, NPE, PRIOR, QUICK, quick
-
-# --- settings ---
 
 NO_NUMBERS = (None, "1", True, 1j, [1.0], np.ones(2), torch.tensor(1.0), math.nan)
 
@@ -77,8 +73,6 @@ def test_a_message_says_what_was_expected_in_words() -> None:
         assert_refused(message, check, "a", value, kind, error=InvalidInputError)
 
 
-# --- tensors ---
-
 X = torch.tensor([[0.1, 0.9], [0.2, 0.8], [0.3, 0.7]])
 
 
@@ -119,18 +113,6 @@ def test_masked_numbers_and_missing_ones_of_a_table_are_nan() -> None:
         assert_refused(match, as_batch, "x", value)
 
 
-def test_parameters_outside_the_prior_are_counted() -> None:
-    prior = BoxUniform(torch.zeros(2), torch.ones(2))
-    theta = torch.cat([X, -X])
-    check_in_support("theta", X, prior)
-    check_in_support("theta", theta, prior, rows=torch.arange(6) < 3)
-    match = r"`theta` inside the support.*3 of 6 rows \(first: \[3, 4, 5\]\)"
-    assert_refused(match, check_in_support, "theta", theta, prior)
-
-
-# --- seeds ---
-
-
 def draws() -> list[float]:
     numbers = float(torch.rand(())), float(np.random.uniform()), random.random()  # noqa: NPY002
     return list(numbers)
@@ -146,9 +128,6 @@ def test_blocks_give_the_same_numbers_again_and_restore_the_state_around_them() 
             raise ArithmeticError
         with seeded(None):
             assert [first, draws()] == expected
-
-
-# --- progress bars ---
 
 
 def test_bars_are_shown_by_default_where_they_can_be_redrawn(
