@@ -120,7 +120,9 @@ def draws_of(pairs: Pairs, prior: PriorDistribution) -> Tensor:
         # Other proposals for each chunk, so that their errors average out.
         with seeded(number):
             nodes, log_posterior = _proposals(pairs[rows], prior)
-            chosen = _systematic(torch.softmax(log_posterior, dim=1), NUM_DRAWS)
+            # NaN where the label fits nothing, see below.
+            shares = torch.softmax(log_posterior, dim=1).nan_to_num(1.0).cpu()
+            chosen = shares.multinomial(NUM_DRAWS, replacement=True).to(y.device)
         parts.append(nodes.theta.take_along_dim(chosen[..., None], 1))
         possible.append(torch.isfinite(log_posterior).any(dim=1))
     # Labels that miss the support by many standard deviations fit nothing, either.
@@ -139,17 +141,6 @@ def _proposals(pairs: Pairs, prior: PriorDistribution) -> tuple[Nodes, Tensor]:
     """Return proposals for labels, and their log densities given the label."""
     nodes = _place_nodes(pairs, [], prior, num_nodes=NUM_PROPOSALS)
     return nodes, nodes.log_weights + prior.log_prob(nodes.theta).double()
-
-
-def _systematic(shares: Tensor, count: int) -> Tensor:
-    """Choose columns of each row by their shares, evenly; shape ``(n, count)``."""
-    steps = (torch.arange(count).to(shares) + 0.5) / count
-    upper = shares.cumsum(dim=1)
-    upper = upper / upper[:, -1:]
-    order = torch.searchsorted(upper, steps.expand(len(shares), -1).contiguous())
-    # In random order, so that any part of the draws represents all of them.
-    shuffled = torch.rand(len(shares), count).argsort(dim=1).to(shares.device)
-    return order.gather(1, shuffled).clamp_max(shares.shape[1] - 1)
 
 
 def nodes_of(

@@ -2,7 +2,6 @@
 
 import copy
 import pickle
-from collections.abc import Iterable
 from typing import Any
 
 import pytest
@@ -28,9 +27,7 @@ from sbi_rope.npe.sbi import (
     estimator_of,
     headless,
     posterior_from,
-    with_embedding,
 )
-from sbi_rope.rope.finetuning import trainable_copy
 from sbi_rope.utils.errors import (
     InvalidInputError,
     LogProbUnavailableError,
@@ -42,7 +39,6 @@ QUIET = {"show_progress_bars": False}
 
 # Families of which sbi assembles the parts in a function each; those of zuko share one.
 ASSEMBLED = ("mdn", "made", "maf", "maf_rqs", "nsf", "zuko_nsf")
-ALL_FAMILIES = (*problems.FAMILIES, *problems.MIXED_FAMILIES)
 
 # Family, embedding net, z_score_x, number of continuous parameters. All families have
 # x with and without a network, and one parameter, where some are built differently.
@@ -62,29 +58,6 @@ CASES = [
 ]
 
 
-@pytest.fixture
-def npe(request: pytest.FixtureRequest) -> Any:
-    """The posterior of an NPE, shared by the session: it must not change."""
-    return problems.npe_posterior(*request.param)
-
-
-def estimator_and_batch(npe: Any) -> tuple[Any, Tensor, Tensor]:
-    theta = npe.prior.sample((24,)).reshape(4, 6, -1)
-    estimator = estimator_of(npe)
-    return estimator, theta, torch.randn(6, *estimator.condition_shape)
-
-
-def with_cases(
-    *, embedding: str | None = None, families: Iterable[str] = ALL_FAMILIES
-) -> Any:
-    cases = [
-        pytest.param(case, id="-".join(map(str, case)))
-        for case in CASES
-        if embedding in (None, case[1]) and case[0] in families
-    ]
-    return pytest.mark.parametrize("npe", cases, indirect=True)
-
-
 def test_every_name_of_sbi_is_among_the_cases_or_refused() -> None:
     refused = {"tabpfn"}  # its posterior is filtered, see below
     tested = {family for family, *_ in CASES}
@@ -92,11 +65,13 @@ def test_every_name_of_sbi_is_among_the_cases_or_refused() -> None:
 
 
 @pytest.mark.medium
-@with_cases()
+@pytest.mark.parametrize("case", CASES, ids=lambda case: "-".join(map(str, case)))
 def test_on_embeddings_densities_and_samples_are_those_of_the_estimator(
-    npe: Any,
+    case: tuple[Any, ...],
 ) -> None:
-    estimator, theta, x = estimator_and_batch(npe)
+    npe = problems.npe_posterior(*case)
+    estimator, theta = estimator_of(npe), npe.prior.sample((24,)).reshape(4, 6, -1)
+    x = torch.randn(6, *estimator.condition_shape)
     q, embeddings = headless(estimator), embed(embedding_of(estimator), x)
     assert embeddings.shape == (6, *q.condition_shape)
     assert embeddings.std(dim=0).min() > 0, "the embedding ignores x"
@@ -109,21 +84,6 @@ def test_on_embeddings_densities_and_samples_are_those_of_the_estimator(
     assert difference.abs().max() == 0
     assert samples.shape == (5, 6, *estimator.input_shape)
     assert (samples - expected).abs().max() == 0
-
-
-@with_cases(embedding="linear", families=(*ASSEMBLED, *problems.MIXED_FAMILIES))
-def test_a_tuned_embedding_in_its_place_changes_the_density_accordingly(
-    npe: Any,
-) -> None:
-    estimator, theta, x = estimator_and_batch(npe)
-    h, q = embedding_of(estimator), headless(estimator)
-    g = trainable_copy(h, embed(h, x))
-    with torch.no_grad():
-        for parameter in g.parameters():
-            parameter += 0.1
-        swapped = with_embedding(estimator, g).log_prob(theta, x)
-        assert torch.allclose(swapped, q.log_prob(theta, embed(g, x)), atol=1e-5)
-        assert (swapped - estimator.log_prob(theta, x)).abs().max() > 1e-3
 
 
 def test_embed_does_not_depend_on_the_batch() -> None:

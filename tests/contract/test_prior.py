@@ -27,7 +27,6 @@ from torch.distributions import (
 
 from sbi_rope import RoPE, load, save, stack
 from sbi_rope.npe.prior import PriorDistribution
-from sbi_rope.utils.errors import InvalidInputError
 from tests.stacks import DEFAULTS, QUIET, quick
 
 ONE, TWO = torch.ones(1), torch.ones(2)
@@ -138,9 +137,6 @@ def test_a_prior_of_sbi_works_from_end_to_end(name: str, tmp_path: Path) -> None
         save(posterior, file)
         again = load(file, trusted=[Slicing, OfArrays])
         assert torch.equal(again.log_prob_batched(samples, x[:4]), log_prob)
-    if not prior.is_unbounded:
-        with pytest.raises(InvalidInputError, match="inside the support"):
-            rope.append_calibration(labels[:1] - 50.0, x[:1])
 
 
 def test_discrete_parameters_are_not_moved_off_their_bounds() -> None:

@@ -46,15 +46,6 @@ def test_sbc_accepts_calibrated_posteriors_and_notices_shifted_ones(
     assert check_uniformity_frequentist(ranks, 200).max() < 1e-3
 
 
-@pytest.mark.slow
-def test_sbc_works_without_batched_sampling_and_in_other_processes(
-    posterior: MixturePosterior, theta: Tensor
-) -> None:
-    options = {"num_workers": 2, "use_batched_sampling": False, **OPTIONS}
-    ranks, _ = run_sbc(theta[:4], posterior.x_o[:4], posterior, **options)
-    assert ranks.shape == (4, 2)
-
-
 def test_expected_coverage_is_nominal_for_calibrated_posteriors(
     posterior: MixturePosterior, theta: Tensor
 ) -> None:

@@ -62,17 +62,6 @@ def test_values_fit_their_hints(
         assert_refused("`setting` to be .*; got", check, "setting", value, kind)
 
 
-def test_a_message_says_what_was_expected_in_words() -> None:
-    for value, kind, words in (
-        (0, Positive, "a number above 0; got 0"),
-        (-1, Seed, "an integer of at least 0 or None; got -1"),
-        (9, Annotated[int, Range(2, 5)], "an integer from 2 to 5; got 9"),
-        ("x", Literal["own", None], r"one of \['own', None\]; got 'x'"),
-    ):
-        message = f"^Expected `a` to be {words}.$"
-        assert_refused(message, check, "a", value, kind, error=InvalidInputError)
-
-
 X = torch.tensor([[0.1, 0.9], [0.2, 0.8], [0.3, 0.7]])
 
 
