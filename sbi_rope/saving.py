@@ -1,9 +1,8 @@
 """Posteriors in files that are loaded without running code from the file.
 
-Torch reads the file with ``weights_only=True`` and makes only what is on a list. Ours
-has the networks, distributions and posteriors of a few packages, the dataclasses of
-this one, and some functions of tensors. None of these imports by name, evaluates text,
-opens a file or unpickles.
+Torch reads the file with ``weights_only=True`` and makes only what is on a list:
+networks, distributions and posteriors of a few packages, dataclasses of this one, and
+functions of tensors. None imports by name, evaluates text, opens a file or unpickles.
 """
 
 import functools

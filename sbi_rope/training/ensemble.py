@@ -1,10 +1,8 @@
 r"""Networks trained and evaluated at once: the parameters of E members in one network.
 
-A step of a small network is not arithmetic but overhead, which E members share if their
-batches are rows of one batch: those of member e are the rows ``e * B`` to
-``(e + 1) * B``. An estimator treats rows independently, so that only the modules that
-hold parameters need to know whose rows they see. These are replaced; everything else
-runs unchanged.
+A step of a small network is mostly overhead, which E members share if their batches
+are rows of one batch: those of member e are the rows ``e * B`` to ``(e + 1) * B``. Only
+modules that hold parameters need to know whose rows they see. These are replaced.
 """
 
 import copy
