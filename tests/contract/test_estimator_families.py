@@ -114,7 +114,7 @@ def test_rope_makes_of_posteriors_of_the_family_others_that_can_be_pickled(
     before = copy.deepcopy(npe.posterior_estimator.state_dict())
     simulate = problems.simulate_image if embedding == "cnn" else problems.simulate
     theta = npe.prior.sample((30,))
-    x, x_o = (simulate(theta) + 0.2).split([10, 20])
+    x, x_o = (simulate(theta) + 1.0).split([10, 20])
     finetuner = CalibrationFinetuner(max_num_epochs=3)
     rope = RoPE(npe, simulator=simulate, finetuner=finetuner)
     rope.append_calibration(theta[:10], x).train(seed=0, **QUIET)
