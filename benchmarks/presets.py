@@ -50,12 +50,6 @@ class Settings:
         )
 
 
-def _finetuner(task: Task) -> CalibrationFinetuner:
-    # People are stored, not simulated at will; 10 was chosen on calibration people.
-    neighbors = 10 if task.name == "hemodynamics" else 1
-    return CalibrationFinetuner(num_neighbors=neighbors)
-
-
 def smoke(task: Task) -> Settings:
     """Return settings that show that everything runs, and nothing else."""
     training = Training(training_batch_size=50, max_num_epochs=3)
@@ -87,7 +81,6 @@ def standard(task: Task) -> Settings:
             stop_after_epochs=10,
             max_num_epochs=max_num_epochs,
         ),
-        finetuner=_finetuner(task),
     )
 
 

@@ -59,10 +59,6 @@ def main() -> None:
     parser.add_argument("--observations", type=Path, help="data set of real people")
     parser.add_argument("--rounds", type=int, default=10, help="recordings a person")
     parser.add_argument("--max-num-epochs", type=int, default=30)
-    # The paper has 1. 10 was better than 1 and 50 on other calibration people.
-    parser.add_argument(
-        "--num-neighbors", type=int, default=10, help="simulated people a target"
-    )
     args = parser.parse_args()
     Study(
         task=get_task(
@@ -75,9 +71,7 @@ def main() -> None:
         ),
         stored=lambda task, seed: split_people(task, seed, args.rounds)["stored"],
         held_out=lambda task, seed: split_people(task, seed, args.rounds)["held_out"],
-        finetuner=CalibrationFinetuner(
-            num_neighbors=args.num_neighbors, max_num_epochs=args.max_tuning_epochs
-        ),
+        finetuner=CalibrationFinetuner(max_num_epochs=args.max_tuning_epochs),
         # Fixed beforehand.
         coupler=SinkhornCoupler(gamma=0.1, tau=1.0),
         seeds=args.seeds,

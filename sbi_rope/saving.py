@@ -1,9 +1,8 @@
 """Posteriors in files that are loaded without running code from the file.
 
-Torch reads the file with ``weights_only=True`` and makes only what is on a list. Ours
-has the networks, distributions and posteriors of a few packages, the dataclasses of
-this one, and some functions of tensors. None of these imports by name, evaluates text,
-opens a file or unpickles.
+Torch reads the file with ``weights_only=True`` and makes only what is on a list:
+networks, distributions and posteriors of a few packages, dataclasses of this one, and
+functions of tensors. None imports by name, evaluates text, opens a file or unpickles.
 """
 
 import functools
@@ -36,31 +35,18 @@ BASES = (nn.Module, Distribution, Transform, Constraint, Posterior, BasePotentia
 PACKAGES = ("sbi.", "sbi_rope.", "torch.distributions.", "torch.nn.modules.")
 # All that these define works on tensors only.
 OF_TENSORS = ("nflows.", "torch._C._nn.", "torch.nn.functional.", "zuko.")
-# Functions that pickle finds as attributes of torch, where there are others.
+# Functions that pickle finds as attributes of torch.
 OF_TORCH = ("exp", "relu", "selu", "sigmoid", "sin", "tanh")
 
 
 def save(posterior: Any, path: str | Path, *, overwrite: bool = False) -> None:
-    """Write a posterior to a file that :func:`load` reads.
-
-    The file is written completely or not at all.
+    """Write a posterior to a file that :func:`load` reads, completely or not at all.
 
     Args:
         posterior: A posterior of this package, or a ``DirectPosterior`` or
             ``VectorFieldPosterior`` of sbi, which several trainers return.
         path: The file. Its folder is made if there is none.
         overwrite: Whether to replace a file that exists.
-
-    Example:
-        >>> import tempfile, torch
-        >>> from sbi.utils import BoxUniform
-        >>> from sbi_rope.density import PriorPosterior
-        >>> posterior = PriorPosterior(BoxUniform(torch.zeros(2), torch.ones(2)))
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     save(posterior, f"{folder}/posterior.pt")
-        ...     again = load(f"{folder}/posterior.pt")
-        >>> again.sample((5,)).shape
-        torch.Size([5, 2])
     """
     check("posterior", posterior, Posterior)
     path = Path(path).expanduser()
@@ -77,7 +63,7 @@ def load(path: str | Path, *, trusted: Sequence[Any] = ()) -> Any:
 
     A file may hold networks, distributions and transforms of torch, nflows, zuko and
     sbi, and classes of this package. All others have to be named. The posterior is on
-    the CPU, wherever it was when it was saved; ``posterior.to("cuda")`` moves it.
+    the CPU.
 
     Args:
         path: The file.
@@ -126,9 +112,8 @@ class _Pickler(pickle.Pickler):
     """Writes arrays as tensors, because the pickles of NumPy name functions."""
 
     def reducer_override(self, obj: Any) -> Any:
-        if isinstance(obj, np.ndarray | np.number | np.bool_):
-            return _from_tensor, (torch.as_tensor(obj),)
-        return NotImplemented
+        is_array = isinstance(obj, np.ndarray | np.number | np.bool_)
+        return (_from_tensor, (torch.as_tensor(obj),)) if is_array else NotImplemented
 
 
 def _from_tensor(value: Tensor) -> Any:
@@ -164,11 +149,9 @@ def _found(name: str) -> Any:
         return None
     if getattr(found, "__module__", None) != module:
         return None  # a module may use what is harmful, but not define it
-    is_known = name.startswith(OF_TENSORS)
-    if isinstance(found, type):
-        is_result = name.startswith("sbi_rope.") and is_dataclass(found)
-        is_known |= is_result or issubclass(found, BASES)
-    return found if is_known else None
+    is_result = name.startswith("sbi_rope.") and is_dataclass(found)
+    is_known = isinstance(found, type) and (is_result or issubclass(found, BASES))
+    return found if is_known or name.startswith(OF_TENSORS) else None
 
 
 def _versions() -> dict[str, str]:

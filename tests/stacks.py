@@ -56,7 +56,6 @@ def quick() -> Iterator[None]:
         "discrepancy.unlabelled.SEARCH": Training(max_num_epochs=5),
         "discrepancy.unlabelled.NUM_HESSIANS": 1,
         "discrepancy.unlabelled.NUM_COMPONENTS": 5,
-        "training.fit.MAX_LOWERED": 0,
     }
     with ExitStack() as patches:
         for name, value in constants.items():

@@ -32,8 +32,6 @@ DISTILLING = Training(
 # Simulations from the prior that observations are coupled with, at most those that are
 # stored, and simulations behind each target.
 NUM_SIMULATIONS, SIMULATIONS_PER_TARGET = 1000, 100
-# The stored simulations whose mean is a target, without a simulator.
-NUM_NEIGHBORS = 10
 # Draws of the mixture of each observation that a density is distilled from.
 NUM_DRAWS = 100
 
@@ -108,7 +106,6 @@ class FRISBI(Method):
             self._data.pairs,
             SIMULATIONS_PER_TARGET,
             embedding,
-            num_neighbors=NUM_NEIGHBORS,
             progress=show_progress_bars,
         )
         aligned = Aligned(

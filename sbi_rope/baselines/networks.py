@@ -1,14 +1,15 @@
 """Networks around an embedding net, and how the baselines train on rows of data."""
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from sbi_rope.data.pairs import epochs_on_pairs
 from sbi_rope.npe.sbi import embed
-from sbi_rope.training.fit import History, Training, fit, shuffled
+from sbi_rope.training.fit import History, Training, fit
 
 # Units of the hidden layers where an estimator has no embedding net of its own.
 HIDDEN = 64
@@ -73,3 +74,8 @@ def fit_rows(
         **options,
     )
     return history
+
+
+def shuffled(rows: Tensor, size: int) -> Iterator[Tensor]:
+    """Pass over rows in random order, in batches of a size."""
+    yield from rows[torch.randperm(len(rows)).to(rows.device)].split(size)

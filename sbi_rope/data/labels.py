@@ -5,10 +5,9 @@ The density of a label y given x averages a posterior over what the label leaves
 .. math:: p(y \mid x) = \int q(\theta \mid x)\, p(y \mid \theta)\, d\theta ,
 
 where exact parameters are fixed and :math:`p(y \mid \theta)` is one for missing ones.
-It is estimated by importance sampling from a mixture of Student t distributions, each a
-reference posterior, taken for normal and updated with the label as in a Kalman filter.
-References are the posteriors to be scored and the prior, so that no density is much
-larger than the mixture.
+It is estimated by importance sampling from a mixture of Student t distributions: the
+posteriors to be scored and the prior, each taken for normal and updated with the label
+as in a Kalman filter, so that no density is much larger than the mixture.
 """
 
 import math
@@ -39,9 +38,6 @@ FREEDOM, JITTER = 5.0, 1e-6
 
 # Means ``(n, d)``, and covariances or their Cholesky factors ``(n, d, d)``.
 Moments = tuple[Tensor, Tensor]
-
-
-# What users pass ----------------------------------------------------------------------
 
 
 def given_labels(
@@ -109,9 +105,6 @@ def given_groups(groups: Any, n: int) -> tuple[Hashable, ...]:
     return names
 
 
-# Draws of parameters ------------------------------------------------------------------
-
-
 def draws_of(pairs: Pairs, prior: PriorDistribution) -> Tensor:
     r"""Draw from :math:`p(\theta \mid y) \propto p(\theta)\, p(y \mid \theta)`.
 
@@ -127,7 +120,9 @@ def draws_of(pairs: Pairs, prior: PriorDistribution) -> Tensor:
         # Other proposals for each chunk, so that their errors average out.
         with seeded(number):
             nodes, log_posterior = _proposals(pairs[rows], prior)
-            chosen = _systematic(torch.softmax(log_posterior, dim=1), NUM_DRAWS)
+            # NaN where the label fits nothing, see below.
+            shares = torch.softmax(log_posterior, dim=1).nan_to_num(1.0).cpu()
+            chosen = shares.multinomial(NUM_DRAWS, replacement=True).to(y.device)
         parts.append(nodes.theta.take_along_dim(chosen[..., None], 1))
         possible.append(torch.isfinite(log_posterior).any(dim=1))
     # Labels that miss the support by many standard deviations fit nothing, either.
@@ -148,29 +143,14 @@ def _proposals(pairs: Pairs, prior: PriorDistribution) -> tuple[Nodes, Tensor]:
     return nodes, nodes.log_weights + prior.log_prob(nodes.theta).double()
 
 
-def _systematic(shares: Tensor, count: int) -> Tensor:
-    """Choose columns of each row by their shares, evenly; shape ``(n, count)``."""
-    steps = (torch.arange(count).to(shares) + 0.5) / count
-    upper = shares.cumsum(dim=1)
-    upper = upper / upper[:, -1:]
-    order = torch.searchsorted(upper, steps.expand(len(shares), -1).contiguous())
-    # In random order, so that any part of the draws represents all of them.
-    shuffled = torch.rand(len(shares), count).argsort(dim=1).to(shares.device)
-    return order.gather(1, shuffled).clamp_max(shares.shape[1] - 1)
-
-
-# Densities of labels ------------------------------------------------------------------
-
-
 def nodes_of(
     pairs: Pairs, samples: Sequence[Tensor], prior: PriorDistribution, *, num_nodes: int
 ) -> Nodes:
     r"""Return the nodes at which the densities of labels are computed.
 
-    Of labels given as draws, these are the draws, weighted by
-    :math:`1 / p(\theta)`, so that scores are relative to those of the prior. Others
-    have at least ``num_nodes``. The ``samples`` are those of each density to be scored,
-    ``(M, n, d)``, at the observation of each label.
+    Labels given as draws have these, weighted by :math:`1 / p(\theta)`, so that scores
+    are relative to those of the prior. Others have at least ``num_nodes``. The
+    ``samples`` are those of each density at the observations, ``(M, n, d)``.
     """
     if pairs.are_drawn:
         log_prior = prior.log_prob(pairs.theta).double()

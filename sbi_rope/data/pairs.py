@@ -136,15 +136,10 @@ class Pairs(Rows):
         _, place, sizes = self.group.unique(return_inverse=True, return_counts=True)
         return self.weight / sizes[place]
 
-    def split(self, fraction: float) -> tuple[Tensor, Tensor]:
-        """Return the rows to train on, and those held out, see :func:`split_pairs`."""
-        train, held_out = split_pairs(self.group, fraction)
-        return train.to(self.group.device), held_out.to(self.group.device)
-
     def folds(self, num_folds: int, *, seed: int | None = None) -> list[Tensor]:
         """Cut rows into folds of like size at random; a group is in one fold."""
-        # scikit-learn's GroupKFold refuses fewer groups than folds, and in which order
-        # it takes groups of equal size depends on its version.
+        # scikit-learn's GroupKFold refuses fewer groups than folds, and its order of
+        # groups of equal size depends on its version.
         groups = groups_of(self.group)
         sizes = torch.bincount(groups)
         with seeded(seed):
@@ -208,30 +203,16 @@ class Nodes(Rows):
         ``log_q`` is :math:`\log q(\theta_{is} \mid x_i)`, of K posteriors ``(n, S, K)``
         or of one ``(n, S)``.
         """
-        terms = self._terms(log_q)
-        return terms.logsumexp(dim=1) - math.log(terms.shape[1])
-
-    def standard_error(self, log_q: Tensor) -> Tensor:
-        """Return the Monte-Carlo error of :meth:`log_mean`, to first order."""
-        terms = self._terms(log_q)
-        largest = terms.amax(dim=1, keepdim=True)
-        ratio = (terms - largest.clamp_min(-1e300)).exp()
-        mean = ratio.mean(dim=1).clamp_min(1e-300)
-        return ratio.std(dim=1) / mean / terms.shape[1] ** 0.5
-
-    def _terms(self, log_q: Tensor) -> Tensor:
         weights = self.log_weights if log_q.ndim == 2 else self.log_weights[..., None]
         # Where the weight is zero, the density may be anything.
-        return weights.where(torch.isneginf(weights), log_q.to(weights) + weights)
-
-
-# Groups -------------------------------------------------------------------------------
+        terms = weights.where(torch.isneginf(weights), log_q.to(weights) + weights)
+        return terms.logsumexp(dim=1) - math.log(terms.shape[1])
 
 
 def groups_of(values: Tensor | Sequence[Hashable]) -> Tensor:
-    """Number rows ``(n, d)``, numbers or names, so that equal ones share a number.
+    """Number rows or names by first appearance, from 0; equal ones share a number.
 
-    Numbers start at 0, in the order of first appearance, on the CPU, shape ``(n,)``.
+    Shape ``(n,)``, on the CPU.
     """
     rows = values.tolist() if isinstance(values, Tensor) else values
     keys = [tuple(row) if isinstance(row, list) else row for row in rows]
@@ -255,10 +236,7 @@ def group_means(values: Tensor, weight: Tensor, group: Tensor) -> tuple[Tensor, 
 
 
 def effective_number(weight: Tensor) -> float:
-    r"""Return the number of equal weights with the precision of these.
-
-    .. math:: \Bigl(\sum_g w_g\Bigr)^2 \Big/ \sum_g w_g^2
-    """
+    r"""Return :math:`(\sum w)^2 / \sum w^2`, as many equal weights are as precise."""
     weight = weight.double()
     return float(weight.sum().square() / weight.square().sum())
 
@@ -272,9 +250,6 @@ def one_of_each_group(groups: Tensor, *, seed: int) -> Tensor:
     chosen = torch.zeros_like(groups, dtype=torch.bool)
     chosen[list(first.values())] = True
     return chosen
-
-
-# The hold-out set ---------------------------------------------------------------------
 
 
 def split_pairs(
@@ -293,22 +268,17 @@ def split_pairs(
     rows = order.argsort()[groups].argsort(stable=True)
     is_held_out = torch.zeros(len(sizes), dtype=torch.bool)
     if len(sizes) >= MIN_PAIRS_FOR_HOLDOUT:
-        wanted = max(1, round(validation_fraction * len(groups)))
-        is_held_out[order[groups_to_hold_out(wanted, sizes[order].tolist())]] = True
+        left = max(1, round(validation_fraction * len(groups)))
+        for group, size in zip(order.tolist(), sizes[order].tolist(), strict=True):
+            if size <= 2 * left:
+                is_held_out[group] = True
+                left -= size
+        if is_held_out.all():
+            is_held_out[order[-1]] = False
+        if not is_held_out.any():
+            is_held_out[order[sizes[order].argmin()]] = True
     held_out = is_held_out[groups[rows]]
     return rows[~held_out], rows[held_out]
-
-
-def groups_to_hold_out(wanted: int, sizes: list[int]) -> list[int]:
-    """Choose some groups, in order, with some ``wanted`` rows, or the smallest."""
-    chosen, total = [], 0
-    for index, size in enumerate(sizes):
-        if total + size - wanted <= wanted - total:
-            chosen.append(index)
-            total += size
-        if total >= wanted:
-            break
-    return chosen[: len(sizes) - 1] or [sizes.index(min(sizes))]
 
 
 def epochs_on_pairs(

@@ -22,8 +22,8 @@ STRENGTHS = (2.0, 5.0, 10.0, 30.0, 100.0)
 # Parameters of pairs are said not to follow the prior if this is less probable. By
 # Markov's inequality, at most one in 19 sets of pairs from the prior gets there.
 IMPROBABLE = 0.05
-# Scores of labels are cut off where one of so many sets of pairs from the prior has a
-# score at one end. Rounding puts labels on a bound, whose scores have no end.
+# Scores of labels, which may be rounded to a bound, are cut off where one of so many
+# sets of pairs from the prior has a score.
 SETS_CUT_OFF = 20
 # Normal scores of a parameter with a more frequent value are not normal.
 MAX_SHARE = 0.05
@@ -61,13 +61,12 @@ def learn_parameters(
     stay distributed as in the prior, given the others.
 
     Args:
-        theta_cal: Parameters of the pairs, shape ``(n_c, d)``. Equal ones count once,
-            because several recordings of one person are one draw from the distribution.
-            Of labels that are not exact, R draws of each, shape ``(n_c, R, d)``, over
-            which the probabilities are averaged.
-        theta: Parameters of at least two simulations from the prior, shape ``(n, d)``.
-        weights: How many draws from the distribution each pair counts as, shape
-            ``(n_c,)``; one if None. The weights of equal parameters are added.
+        theta_cal: Parameters of the pairs, ``(n_c, d)``, or R draws of each label,
+            ``(n_c, R, d)``, over which the probabilities are averaged. Equal ones are
+            one draw from the distribution.
+        theta: Parameters of at least two simulations from the prior, ``(n, d)``.
+        weights: How many draws each pair counts as, ``(n_c,)``; those of equal
+            parameters are added. If None, equal parameters count once.
     """
     theta = as_batch("theta", theta, np.shape(theta)[-1:])
     several = np.shape(theta_cal)[1:-1][:1]

@@ -8,16 +8,15 @@ from typing import Any
 
 import joblib
 import torch
-from scipy.stats import kstest
 from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_rope.data.pairs import Pairs, Rows
 from sbi_rope.npe.prior import check_in_support
 from sbi_rope.utils.errors import InvalidInputError, SimulationError, warn_user
-from sbi_rope.utils.progress import progress_bar
+from sbi_rope.utils.progress import is_shown, progress_bar
 from sbi_rope.utils.seeds import seeded
-from sbi_rope.utils.settings import Count, check
+from sbi_rope.utils.settings import Count, Settings, check
 from sbi_rope.utils.tensors import as_batch, as_numbers, divisors
 
 Embed = Callable[[Tensor], Tensor]
@@ -26,12 +25,12 @@ Readable = Callable[[Tensor], Tensor]
 # Simulations ``(n, *event)``, NaN where the simulator raised, and its first error.
 Result = tuple[Tensor, str]
 
-# A simulator may fail at some parameters, so that it is tried at so many.
+# Parameters at which a simulator is tried, because it may fail at some.
 TRIES = 5
 # Rows that are simulated before they are embedded, in batches and one by one, and those
 # of a batch that a worker gets.
 BATCHED_CHUNK, SINGLE_CHUNK, ROWS_OF_WORKER = 1000, 100, 100
-# A progress bar appears after this many seconds.
+# Seconds after which a progress bar appears.
 DELAY = 2.0
 # The most numbers in simulations that are kept, in distances that are computed at once,
 # and in the simulations that planes are fitted to at once.
@@ -39,11 +38,8 @@ MAX_KEPT, MAX_DISTANCES, MAX_NUMBERS = 2**27, 50_000_000, 2**24
 # The fewest stored simulations that a plane is fitted to, and the ridge that keeps it
 # level where parameters do not vary.
 NUM_AROUND, LEVEL = 50, 1e-6
-# Draws of the prior that stored parameters are compared with, and the p-value below
-# which they differ.
-NUM_FROM_PRIOR, NOT_FROM_PRIOR = 10_000, 1e-6
-# A quadratic surface has so many simulations for each of its coefficients, at least.
-# The ridge is relative to the number of simulations.
+# The fewest simulations for each coefficient of a quadratic surface, and a ridge
+# relative to the number of simulations.
 SIMULATIONS_PER_COEFFICIENT, RIDGE = 3, 1e-4
 
 
@@ -52,15 +48,12 @@ def all_finite(x: Tensor) -> Tensor:
     return torch.isfinite(x).flatten(1).all(dim=1)
 
 
-# A user's simulator -------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class ParallelSimulator:
+@dataclass(frozen=True, kw_only=True)
+class ParallelSimulator(Settings):
     """A simulator that is called in worker processes, see :func:`parallel`."""
 
     simulator: Callable[[Any], Any]
-    num_workers: int
+    num_workers: Count
 
     def __call__(self, theta: Any) -> Any:
         """Simulate in this process, exactly as the simulator does."""
@@ -88,9 +81,7 @@ def parallel(
         >>> parallel(simulator, num_workers=4).num_workers
         4
     """
-    check("simulator", simulator, Callable)
-    check("num_workers", num_workers, Count)
-    return ParallelSimulator(simulator, int(num_workers))
+    return ParallelSimulator(simulator=simulator, num_workers=num_workers)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,18 +113,14 @@ class _Way:
         return x.reshape(expected).to(self.like, copy=True)
 
     def simulate(self, theta: Tensor, seed: int | None = None) -> Result:
-        """Simulate theta ``(n, d)``; if a batch raises, its rows one by one."""
+        """Simulate theta ``(n, d)``, as one batch or row by row."""
         x, error = self.like.new_full((len(theta), *self.like.shape[1:]), torch.nan), ""
+        rows: Any = [slice(None)] if self.batched else range(len(theta))
         with seeded(seed):
-            if self.batched:
+            for row in rows:
                 try:
-                    return self.x_of(theta), error
+                    x[row] = self.x_of(theta[row])
                 except Exception as raised:  # of any type
-                    error = repr(raised)
-            for row, one in enumerate(theta.split(1) if self.batched else theta):
-                try:
-                    x[row] = self.x_of(one).reshape(x.shape[1:])
-                except Exception as raised:
                     error = error or repr(raised)
         return x, error
 
@@ -141,8 +128,7 @@ class _Way:
 class Simulated:
     """A user's simulator, called in the first way in which it returns the right shape.
 
-    Simulations that are not ``readable`` are dropped, counted and warned of. Others are
-    like the empty batch ``like``, in shape, dtype and device.
+    Simulations that are not ``readable`` are dropped, counted and warned of.
     """
 
     def __init__(
@@ -160,7 +146,6 @@ class Simulated:
         self._prior, self._like, self._readable = prior, like, readable
         self.num_dropped = self.num_calls = 0
         self._kept: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
-        # With a seed of its own, so that no result depends on it.
         with seeded(0):
             self._way = self._working_way(function)
 
@@ -193,7 +178,6 @@ class Simulated:
         )
         empty = ~ok.reshape(theta.shape[:2]).any(dim=1)
         if empty.any():
-            # Row numbers would mislead, because these may be some of the pairs only.
             raise SimulationError(
                 "All simulations at the calibration parameters "
                 f"{theta[empty].mean(dim=1)[:5].tolist()} failed. Remove these pairs."
@@ -282,25 +266,21 @@ def _warn_of_dropped(ok: Tensor, what: str, because: str = "") -> int:
     return dropped
 
 
-# Stored simulations -------------------------------------------------------------------
-
-
 class Stored:
     """Stored pairs of theta ``(N, d)`` from the prior and x ``(N, *event)``."""
 
     num_calls = num_dropped = 0
 
     def __init__(self, theta: Tensor, x: Tensor) -> None:
-        self._pairs: tuple[Tensor, Tensor] | None = (theta, x)
+        self.theta, self.x = theta, x
 
     def from_prior(
         self, n: int, *, seed: int | None = None, progress: bool = False
     ) -> tuple[Tensor, Tensor]:
         """Return up to n pairs, chosen at random."""
-        theta, x = self._all(progress=progress)
         with seeded(seed):
-            chosen = torch.randperm(len(x))[:n].to(x.device)
-        return theta[chosen], x[chosen]
+            chosen = torch.randperm(len(self.x))[:n].to(self.x.device)
+        return self.theta[chosen], self.x[chosen]
 
     def at(self, theta: Tensor, embed: Embed, *, progress: bool = False) -> Tensor:
         r"""Return stored simulations near the parameters, moved to them.
@@ -315,14 +295,13 @@ class Stored:
 
         Source: regression adjustment, https://doi.org/10.1093/genetics/162.4.2025.
         """
-        stored, x = self._all(progress=progress)
         n, count, d = theta.shape
-        number = min(len(x), max(NUM_AROUND, 5 * (d + 1)))
+        number = min(len(self.x), max(NUM_AROUND, 5 * (d + 1)))
         # Exact parameters are the same for all s.
         at, place = theta.flatten(0, 1).unique(dim=0, return_inverse=True)
-        nearest, stored, at = _nearest(stored, at, number)
+        nearest, stored, at = _nearest(self.theta, at, number)
         used, row = nearest.unique(return_inverse=True)
-        z = torch.cat([embed(x[some]) for some in used.split(BATCHED_CHUNK)])
+        z = torch.cat([embed(self.x[some]) for some in used.split(BATCHED_CHUNK)])
         turn = (torch.arange(count) % number).repeat(n).to(place)
         ridge = torch.tensor([0.0] + [LEVEL] * d).to(at).double().diag()
         scale = ((number - 1) / max(1, number - d - 1)) ** 0.5
@@ -337,34 +316,6 @@ class Stored:
             residual = around[each, k] - (design[each, None, k] @ plane)[:, 0]
             moved.append((plane[:, 0] + scale * residual).to(z))
         return torch.cat(moved).reshape(n, count, -1)
-
-    def near(
-        self, theta: Tensor, count: int, embed: Embed, *, progress: bool = False
-    ) -> Tensor:
-        """Embed the simulations nearest to each theta, ``(n, d)`` to ``(n, K, l)``."""
-        stored, x = self._all(progress=progress)
-        rows, _, _ = _nearest(stored, theta, min(count, len(x)))
-        return embed(x[rows.flatten()]).reshape(*rows.shape, -1)
-
-    def _all(self, *, progress: bool) -> tuple[Tensor, Tensor]:
-        assert self._pairs is not None
-        return self._pairs
-
-
-class Budget(Stored):
-    """Simulations from the prior, made when first needed, then used as stored ones."""
-
-    def __init__(self, simulated: Simulated, n: int) -> None:
-        self._simulated, self._n, self._pairs = simulated, n, None
-
-    def _all(self, *, progress: bool) -> tuple[Tensor, Tensor]:
-        if self._pairs is None:
-            # With a seed of their own, they do not depend on who asks first.
-            with seeded(0):
-                self._pairs = self._simulated.from_prior(self._n, progress=progress)
-            self.num_calls = self._simulated.num_calls
-            self.num_dropped = self._simulated.num_dropped
-        return self._pairs
 
 
 def _nearest(
@@ -394,7 +345,7 @@ def source_of(
     like: Tensor,
     readable: Readable = all_finite,
 ) -> Source:
-    """Return a simulator, called ``num_simulations`` times at most, or stored pairs."""
+    """Return a simulator or stored pairs, which a budget of simulations becomes."""
     check("num_simulations", num_simulations, Count | None)
     if (simulator is None) == (simulations is None):
         raise InvalidInputError(
@@ -403,7 +354,12 @@ def source_of(
         )
     if simulations is None:
         source = Simulated(simulator, prior, like=like, readable=readable)
-        return source if num_simulations is None else Budget(source, num_simulations)
+        if num_simulations is None:
+            return source
+        shown = is_shown(None)
+        stored = Stored(*source.from_prior(num_simulations, seed=0, progress=shown))
+        stored.num_calls, stored.num_dropped = source.num_calls, source.num_dropped
+        return stored
     if num_simulations is not None:
         raise InvalidInputError("Expected `num_simulations` with a simulator only.")
     theta, x = simulations
@@ -414,21 +370,9 @@ def source_of(
     if not valid.any():
         raise SimulationError("All stored simulations contain NaN or Inf.")
     check_in_support("simulations[0]", theta[valid], prior)
-    with seeded(0):
-        drawn = prior.sample(torch.Size((NUM_FROM_PRIOR,)))
-    columns = zip(theta[valid].T.cpu().numpy(), drawn.T.cpu().numpy(), strict=True)
-    p_values = [kstest(*both, method="asymp").pvalue for both in columns]
-    if unlike := [k for k, p in enumerate(p_values) if p < NOT_FROM_PRIOR]:
-        warn_user(
-            f"The parameters {unlike} of `simulations` (counted from 0) are not "
-            "distributed like the prior, as whose draws they are used."
-        )
     stored = Stored(theta[valid], x[valid].to(like))
     stored.num_dropped = _warn_of_dropped(valid, "stored simulations")
     return stored
-
-
-# Targets and moments at the parameters of pairs ---------------------------------------
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -460,10 +404,9 @@ class Moments(Rows):
 def draws(
     source: Source, pairs: Pairs, count: int, embed: Embed, *, progress: bool = False
 ) -> tuple[Tensor, Tensor]:
-    """Simulate at the draws of each pair, ``count`` times at exact parameters.
+    """Return parameters ``(n, S, d)`` and embeddings ``(n, S, l)``, S at least count.
 
-    Return parameters ``(n, S, d)`` and embeddings ``(n, S, l)``. A simulation that
-    failed is replaced by another one of the pair.
+    A simulation that failed is replaced by another one of the pair.
     """
     theta = pairs.theta.repeat(1, -(-count // pairs.theta.shape[1]), 1)
     z = source.at(theta, embed, progress=progress)
@@ -478,22 +421,12 @@ def draws(
 
 
 def targets(
-    source: Source,
-    pairs: Pairs,
-    count: int,
-    embed: Embed,
-    *,
-    num_neighbors: int,
-    progress: bool = False,
+    source: Source, pairs: Pairs, count: int, embed: Embed, *, progress: bool = False
 ) -> Tensor:
     r"""Return :math:`E[h(S(\theta)) \mid y_i]`, the mean of ``count`` simulations.
 
     Its shape is ``(n, l)``. Over labels that are not exact it averages parameters, too.
-    Of stored simulations, those with the ``num_neighbors`` nearest parameters count.
     """
-    if isinstance(source, Stored) and pairs.are_exact:
-        near = source.near(pairs.mean, num_neighbors, embed, progress=progress)
-        return near.mean(dim=1)
     theta = pairs.theta[:, torch.arange(count) % pairs.theta.shape[1]]
     return source.at(theta, embed, progress=progress).nanmean(dim=1)
 

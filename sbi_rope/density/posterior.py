@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+from sbi.inference import DirectPosterior
 from torch import Tensor
 from torch.distributions import Distribution
 
@@ -13,7 +14,7 @@ from sbi_rope.density.base import MAX_ENTRIES, Accept, Density, Prior
 from sbi_rope.density.coupled import Coupled
 from sbi_rope.density.sets import MakesSets
 from sbi_rope.npe.prior import PriorDistribution
-from sbi_rope.npe.sbi import BaseDirectPosterior, MixedDensity
+from sbi_rope.npe.sbi import MixedDensity
 from sbi_rope.npe.standardisation import warn_of_far_entries
 from sbi_rope.utils.errors import InvalidInputError, SamplingError
 from sbi_rope.utils.progress import is_shown, progress_bar
@@ -31,7 +32,7 @@ MIN_ACCEPTANCE = 1e-3
 SMALL_BATCH = 512
 
 
-class MixturePosterior(MakesSets, BaseDirectPosterior):
+class MixturePosterior(MakesSets, DirectPosterior):
     r"""A density as an sbi posterior, such as RoPE's mixture over simulations.
 
     .. math::
@@ -127,8 +128,15 @@ class MixturePosterior(MakesSets, BaseDirectPosterior):
 
     def set_default_x(self, x: Tensor) -> "MixturePosterior":
         """Set the observation ``(*event)`` of methods that are given none."""
-        self._keep_default_x(self._one_x(x))
+        self._x, self._map = self._one_x(x).clone().to(self._device), None
         return self
+
+    def _x_else_default_x(self, x: Any) -> Tensor:
+        return self._one_x(x)  # sbi itself refuses any NaN
+
+    def __getstate__(self) -> dict[str, Any]:
+        # sbi hands out its own __dict__, which a shallow copy would then share.
+        return dict(self.__dict__)
 
     def _one_x(self, x: Any) -> Tensor:
         return self._batch_of_x(self.default_x if x is None else x, rows=1)

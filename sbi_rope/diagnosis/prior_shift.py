@@ -102,13 +102,8 @@ class HeldOut(NamedTuple):
 def cross_fit(rope: RoPE, num_folds: int, *, show: bool) -> HeldOut:
     """Embed each calibration pair by a g that was trained on the other folds."""
     pairs, h, finetuner = rope.pairs, rope.npe.h, rope.finetuner
-    of_pairs = targets(
-        rope.source,
-        pairs,
-        finetuner.simulations_per_target,
-        partial(embed, h),
-        num_neighbors=finetuner.num_neighbors,
-    )
+    count = finetuner.simulations_per_target
+    of_pairs = targets(rope.source, pairs, count, partial(embed, h))
     # Recordings of one person share a fold, as they do in a stack.
     folds = pairs.folds(num_folds)
     others = [torch.cat([*folds[:k], *folds[k + 1 :]]) for k in range(len(folds))]

@@ -5,7 +5,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_rope.data.pairs import MIN_PAIRS_FOR_HOLDOUT, Nodes, epochs_on_pairs
+from sbi_rope.data.pairs import (
+    MIN_PAIRS_FOR_HOLDOUT,
+    Nodes,
+    epochs_on_pairs,
+    split_pairs,
+)
 from sbi_rope.density import Flow, MixturePosterior
 from sbi_rope.methods.base import Method
 from sbi_rope.methods.training import EstimatorBuilder
@@ -114,7 +119,8 @@ class FinetunedNPE(Method):
         """Return the rows to train on and those held out, for each network."""
         pairs = self._data.pairs
         if self.num_holdouts == 1 or pairs.num_groups < MIN_PAIRS_FOR_HOLDOUT:
-            return [pairs.split(self.training.validation_fraction)]
+            parts = split_pairs(pairs.group, self.training.validation_fraction)
+            return [(parts[0].to(pairs.group), parts[1].to(pairs.group))]
         every = torch.arange(len(pairs)).to(pairs.group)
         folds = pairs.folds(self.num_holdouts)
         return [(every[~torch.isin(every, rows)], rows) for rows in folds]

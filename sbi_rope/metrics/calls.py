@@ -16,7 +16,7 @@ from sbi.inference import DirectPosterior, EnsemblePosterior, VectorFieldPosteri
 from torch import Tensor, nn
 
 from sbi_rope.density import Density, MixturePosterior, PriorPosterior
-from sbi_rope.npe.sbi import NeuralPosterior, is_bounded, readable
+from sbi_rope.npe.sbi import NeuralPosterior, readable
 from sbi_rope.utils.errors import InvalidInputError
 from sbi_rope.utils.settings import Range, check
 from sbi_rope.utils.tensors import as_batch, as_numbers, rows_with
@@ -84,8 +84,9 @@ def samples_of(
 
 def log_probs_of(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
     """Return the log density of each true parameter, float64, shape ``(n,)``."""
-    is_direct = isinstance(posterior, DirectPosterior) and not is_bounded(posterior)
-    arguments: Any = {"norm_posterior": False} if is_direct else {}
+    of_sbi = isinstance(posterior, DirectPosterior)
+    is_unbounded = of_sbi and not isinstance(posterior, MixturePosterior)
+    arguments: Any = {"norm_posterior": False} if is_unbounded else {}
     with torch.no_grad():
         found = posterior.log_prob_batched(theta, x=x.clone(), **arguments)
     if found.numel() != len(theta):
@@ -137,5 +138,5 @@ def _is_unbounded(posterior: Any) -> bool:
     if isinstance(posterior, EnsemblePosterior):
         return any(_is_unbounded(member) for member in posterior.posteriors)
     if isinstance(posterior, DirectPosterior):
-        return not is_bounded(posterior)
+        return not isinstance(posterior, MixturePosterior)
     return isinstance(posterior, VectorFieldPosterior)

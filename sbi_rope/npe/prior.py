@@ -46,15 +46,10 @@ class PriorDistribution(Distribution):
         self._some = draws
         super().__init__(event_shape=draws.shape[1:], validate_args=False)
 
-    def __repr__(self) -> str:
-        return repr(self._own)
-
     def to(self, device: Any) -> None:
         """Move the prior to a device."""
         self._own = move_distribution_to_device(self._own, device)
         self._some = self._some.to(device)
-
-    # --- draws and density ---
 
     def sample(self, sample_shape: Any = ()) -> Tensor:
         """Draw parameters, shape ``(*sample_shape, d)``."""
@@ -87,8 +82,6 @@ class PriorDistribution(Distribution):
         """Return theta ``(n, d)``, rows outside replaced, and which were inside."""
         inside = self.inside(theta)
         return theta.where(inside[:, None], self._some.to(theta)), inside
-
-    # --- bounds ---
 
     @property
     def support(self) -> Any:
@@ -124,8 +117,6 @@ class PriorDistribution(Distribution):
         inside = theta.clamp(low.nextafter(high), high.nextafter(low))
         is_discrete = _entries(self._support, theta, "is_discrete", 0.0) > 0
         return theta.where(is_discrete, inside)
-
-    # --- units ---
 
     @property
     def mean(self) -> Tensor:

@@ -44,15 +44,11 @@ from sbi_rope.utils.seeds import seeded
 from sbi_rope.utils.settings import names_of
 from sbi_rope.utils.tensors import as_batch, rows_with
 
-# A row may differ by this share of the largest embedding when it is alone. Rounding
-# depends on the size of a batch, and is largest for convolutions on a GPU.
+# A row may differ by this share of the largest embedding when it is alone.
 ROUNDING = 0.01
 # An entry does not vary if its standard deviation is less than this share of its mean,
 # or what sbi divides it by then.
 CONSTANT, SMALLEST_STD = 1e-6, 1e-7
-
-
-# --- an estimator, split into h and q ---
 
 
 def embedding_of(estimator: ConditionalEstimator) -> nn.Module:
@@ -175,36 +171,24 @@ def readable(net: nn.Module, x: Tensor) -> Tensor:
     except Exception:  # nets refuse NaN with errors of any kind
         return can_read
     can_read[partial] = torch.isfinite(embedded).flatten(1).all(dim=1)
+    if not (partial & can_read).any():
+        return can_read
+    # sbi 0.27 takes the number of trials from another row if trials have several
+    # columns. Sets with some, no and most trials missing stand side by side here.
     some = x[partial & can_read][:2]
     full = some.nan_to_num(0.0)
     sparse = full.clone()
     if x.ndim > 2:
         sparse[:, 1:] = torch.nan
-    # sbi 0.27 takes the number of trials from another row if trials have several
-    # columns. Sets with some, no and most trials missing stand side by side here.
-    check_rows_apart(net, torch.stack([some, full, sparse], dim=1).flatten(0, 1))
-    return can_read
-
-
-def check_rows_apart(net: nn.Module, x: Tensor) -> None:
-    """Raise if the embedding of a row is another one alone than among other rows."""
-    try:
-        together = embed(net, x)
-        alone = torch.cat([embed(net, row) for row in x.split(1)])
-    except Exception:  # the net may take no such numbers
-        return
-    usable = torch.isfinite(together) & torch.isfinite(alone)
-    if not usable.any():
-        return
-    size = together[usable].abs().max()
-    if bool(((together - alone).abs()[usable] > ROUNDING * size).any()):
+    sets = torch.stack([some, full, sparse], dim=1).flatten(0, 1)
+    together = embed(net, sets).nan_to_num(0.0)
+    alone = torch.cat([embed(net, row) for row in sets.split(1)]).nan_to_num(0.0)
+    if ((together - alone).abs() > ROUNDING * together.abs().max()).any():
         raise UnsupportedPosteriorError(
             "Expected an embedding net that reads each observation by itself; got "
             "another embedding of a row alone than in a batch."
         )
-
-
-# --- estimators in the shape of densities that can be mixed ---
+    return can_read
 
 
 class MixedDensity(ConditionalDensityEstimator):
@@ -267,19 +251,16 @@ class VectorFieldDensity(ConditionalDensityEstimator):
         self, sample_shape: torch.Size, condition: Tensor, **kwargs: Any
     ) -> Tensor:
         """Solve the ODE or SDE for every condition; no prior support is enforced."""
-        options = {"sample_with": self.sample_with}
-        posterior = _built(
-            VectorFieldPosterior, self.vector_field, self.prior, **options
-        )
+        how: Any = {"show_progress_bars": False, "reject_outside_prior": False}
         with warnings.catch_warnings():
             # Draws outside the prior are rejected by the mixture; the batch is ours.
             warnings.simplefilter("ignore")
-            return posterior.sample_batched(
-                sample_shape,
-                condition,
-                show_progress_bars=False,
-                reject_outside_prior=False,
-            )
+            return _built(
+                VectorFieldPosterior,
+                self.vector_field,
+                self.prior,
+                sample_with=self.sample_with,
+            ).sample_batched(sample_shape, condition, **how)
 
     def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
         """Raise: the density of a vector field is not evaluated."""
@@ -291,9 +272,6 @@ class VectorFieldDensity(ConditionalDensityEstimator):
     def loss(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
         """Return the loss of the vector field."""
         return self.vector_field.loss(input, condition, **kwargs)
-
-
-# --- posteriors ---
 
 
 def estimator_of(posterior: Any) -> ConditionalEstimator:
@@ -320,68 +298,36 @@ def estimator_of(posterior: Any) -> ConditionalEstimator:
 
 
 def check_density(
-    estimator: Any, *, what: str = "an estimator", because: str = ""
+    estimator: Any, *, what: str = "an estimator"
 ) -> ConditionalDensityEstimator:
     """Return an estimator if it has a density; say what needs one otherwise."""
     if not isinstance(estimator, ConditionalDensityEstimator):
-        clause = f", because {because}" if because else ""
         raise UnsupportedPosteriorError(
-            f"Expected {what} with a density, such as that of NPE{clause}; got "
+            f"Expected {what} with a density, such as that of NPE; got "
             f"{type(estimator).__name__}. Train NPE instead of FMPE or NPSE."
         )
     return estimator
-
-
-def is_bounded(posterior: DirectPosterior) -> bool:
-    """Tell whether a posterior does without sbi's rejection, which may never end."""
-    return isinstance(posterior, BaseDirectPosterior)
 
 
 def posterior_from(
     posterior: Any, estimator: Any
 ) -> DirectPosterior | VectorFieldPosterior:
     """Return an sbi posterior of the same kind as ``posterior`` around an estimator."""
-    options = {"enable_transform": posterior.enable_transform}
-    if isinstance(estimator, ConditionalDensityEstimator):
-        return direct_posterior(estimator, posterior.prior, **options)
-    options["sample_with"] = posterior.sample_with
-    prior = copy.deepcopy(posterior.prior)
-    return _built(VectorFieldPosterior, estimator, prior, **options)
+    kind, options = DirectPosterior, {"enable_transform": posterior.enable_transform}
+    if not isinstance(estimator, ConditionalDensityEstimator):
+        kind, options["sample_with"] = VectorFieldPosterior, posterior.sample_with
+    return _built(kind, estimator, posterior.prior, **options)
 
 
-def direct_posterior(
-    estimator: ConditionalDensityEstimator,
-    prior: Distribution,
-    *,
-    enable_transform: bool = True,
-) -> DirectPosterior:
-    """Return an sbi posterior around an estimator and a copy of the prior."""
-    options = {"enable_transform": enable_transform}
-    return _built(DirectPosterior, estimator, copy.deepcopy(prior), **options)
+def direct_posterior(estimator: Any, prior: Distribution) -> DirectPosterior:
+    """Return an sbi posterior around a density and a copy of the prior."""
+    return _built(DirectPosterior, estimator, prior)
 
 
 def _built(kind: type, estimator: Any, prior: Distribution, **options: Any) -> Any:
+    device = parameter_of(estimator).device
     with seeded(0):  # sbi draws from the prior to look at it
-        return kind(estimator, prior, device=parameter_of(estimator).device, **options)
-
-
-class BaseDirectPosterior(DirectPosterior):
-    """sbi's DirectPosterior, for our own posteriors to derive from.
-
-    Shallow copies share no state. They check observations in ``_one_x``: sbi itself
-    refuses any NaN, which some embedding nets can read.
-    """
-
-    def _x_else_default_x(self, x: Any) -> Tensor:
-        return self._one_x(x)  # type: ignore[attr-defined]
-
-    def _keep_default_x(self, x: Tensor) -> None:
-        """Set the default x to a copy of an observation that was checked."""
-        self._x, self._map = x.clone().to(self._device), None
-
-    def __getstate__(self) -> dict[str, Any]:
-        # sbi hands out its own __dict__, which a shallow copy would then share.
-        return dict(self.__dict__)
+        return kind(estimator, copy.deepcopy(prior), device=device, **options)
 
 
 class TrainedNPE:
@@ -413,10 +359,6 @@ class TrainedNPE:
         if parameter_names is not None:
             self.parameter_names = names_of(parameter_names, self.like.shape[1])
         self.x_names: tuple[str, ...] | None = None
-        with seeded(0):
-            x = torch.randn(4, *self.event_shape).to(self.like)
-        mean, std = standardisation_of(self.h) or (0.0, 1.0)
-        check_rows_apart(self.h, mean + std * x)
         leave_out_constants(self.h)
 
     def posterior(self, embedding_net: nn.Module | None = None) -> Any:

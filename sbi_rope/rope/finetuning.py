@@ -68,8 +68,6 @@ class CalibrationFinetuner(Settings):
             single simulations.
         resample_targets: Whether to draw new simulations in every epoch, as the paper
             does, instead of once before the first.
-        num_neighbors: With stored simulations, the expectation is estimated by the mean
-            over this many simulations with the nearest parameters.
         validation_fraction: The share of the pairs that is held out, at most 0.5.
         rehearsal: :math:`\lambda`, not negative. The default is 0, as in the paper.
     """
@@ -79,7 +77,6 @@ class CalibrationFinetuner(Settings):
     stop_after_epochs: Count = 200
     simulations_per_target: Count = 100
     resample_targets: bool = False
-    num_neighbors: Count = 1
     validation_fraction: Annotated[float, Range(0, 0.5)] = 0.2
     rehearsal: NotNegative = 0.0
 

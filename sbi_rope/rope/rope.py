@@ -65,13 +65,13 @@ class RoPE:
             ``(d,)`` to one ``(*event)``; tensors or NumPy arrays. A row of x may depend
             on the same row of theta only, with noise from the global generator of
             torch, NumPy or Python. Simulations that the embedding net cannot read (NaN
-            or Inf), and those for which the simulator raises, are dropped and counted.
+            or Inf), and calls in which the simulator raises, are dropped and counted.
             :func:`~sbi_rope.parallel` calls it in several processes.
         simulations: Instead of a simulator, stored pairs (theta, x) with theta drawn
-            from the prior. There is a warning if theta is distributed otherwise.
+            from the prior.
         num_simulations: For a slow simulator, the number of simulations in all. They
-            are made from the prior when they are first needed, and then used like
-            stored ones. ``docs/howto/simulators.md`` says how many are made if None.
+            are made from the prior at once, and then used like stored ones.
+            ``docs/howto/simulators.md`` says how many are made if None.
         finetuner: Settings of step 1; ``CalibrationFinetuner()`` if None.
         coupler: Settings of step 2; ``SinkhornCoupler()`` if None.
         parameter_names: One name for each parameter. If None, the columns of the first
@@ -251,8 +251,7 @@ class RoPE:
         def draw_targets() -> Tensor:
             of_pairs = source, pairs, how.simulations_per_target, h
             if pairs.are_exact:
-                neighbors = how.num_neighbors
-                return targets(*of_pairs, num_neighbors=neighbors, progress=show)
+                return targets(*of_pairs, progress=show)
             _, x_s = source.from_prior(MIN_SIMULATIONS, seed=0, progress=show)
             return tuning_targets(
                 h(pairs.x),

@@ -102,11 +102,7 @@ def stack(
         seed=of_data,
         show_progress_bars=is_shown(show_progress_bars),
     )
-    check_density(
-        data.estimator,
-        what="a RoPE of a posterior",
-        because="candidates are scored by the density of held-out parameters",
-    )
+    check_density(data.estimator, what="a RoPE of a posterior")
     if candidates is None:
         known = default_candidates(x_o=x_o)
         chosen = [one for one in known if one.suits(data)]

@@ -1,10 +1,8 @@
 r"""Networks trained and evaluated at once: the parameters of E members in one network.
 
-A step of a small network is not arithmetic but overhead, which E members share if their
-batches are rows of one batch: those of member e are the rows ``e * B`` to
-``(e + 1) * B``. An estimator treats rows independently, so that only the modules that
-hold parameters need to know whose rows they see. These are replaced; everything else
-runs unchanged.
+A step of a small network is mostly overhead, which E members share if their batches
+are rows of one batch: those of member e are the rows ``e * B`` to ``(e + 1) * B``. Only
+modules that hold parameters need to know whose rows they see. These are replaced.
 """
 
 import copy
@@ -99,10 +97,8 @@ class _Linear(_Stacked):
         if mask is not None:
             weight = weight * mask
         rows = x.reshape(len(weight), -1, x.shape[-1])
-        if bias:
-            y = torch.baddbmm(bias[0][:, None], rows, weight.mT)
-        else:
-            y = rows @ weight.mT
+        args = rows, weight.mT
+        y = torch.baddbmm(bias[0][:, None], *args) if bias else torch.bmm(*args)
         return y.reshape(*x.shape[:-1], weight.shape[1])
 
 
@@ -135,11 +131,7 @@ class _LULinear(_Stacked):
 
 
 class _Loop(_Stacked):
-    """Any other module with parameters: each member sees its own rows.
-
-    The parameters of the members are views of the stacks also when gradients are
-    computed, because some layers evaluate their network once more then.
-    """
+    """Any other module with parameters: each member sees its own rows."""
 
     def forward(self, *rows: Any, **options: Any) -> Any:
         return self.answer(nn.Module.__call__, *rows, **options)
@@ -175,26 +167,19 @@ STACKED: dict[type[nn.Module], type[_Stacked]] = {
 
 
 class Ensemble(nn.Module):
-    """E networks of one architecture, in evaluation mode.
+    """Copies of networks that differ in parameters only, in evaluation mode.
 
     Args:
-        members: The networks; they are copied. The same one may appear several times.
+        members: The networks. The same one may appear several times.
         question: What the network will be asked, such as :func:`log_density`.
         example: Rows to ask it. A network that mixes up the rows of members, such as
             one that puts another dimension first, is looped over as a whole.
     """
 
     def __init__(
-        self,
-        members: Sequence[nn.Module],
-        question: Question,
-        example: Sequence[Tensor],
+        self, members: Sequence[nn.Module], question: Question, example: Sequence[Any]
     ) -> None:
         super().__init__()
-        first, *others = (list(member.buffers()) for member in members)
-        for buffers in others:  # such as means and deviations by which x is divided
-            if not all(map(torch.equal, first, buffers)):
-                raise ValueError("Expected members that differ in parameters only.")
         self.num_members = len(members)
         self.net = _stacked(members)
         is_one = len(members) == 1 or not list(self.parameters())

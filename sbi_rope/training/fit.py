@@ -13,9 +13,6 @@ from sbi_rope.utils.errors import warn_user
 from sbi_rope.utils.progress import progress_bar
 from sbi_rope.utils.settings import Count, Level, Positive, Settings
 
-# A course that made the loss worse is repeated from the better state with this share of
-# its rate, and not more often than so many times.
-LOWER, MAX_LOWERED = 0.3, 2
 # Share of a course in which its step size rises.
 WARM_UP = 0.1
 # Of Adam, as in torch.
@@ -78,11 +75,8 @@ class History:
 class Courses:
     """Trainings that follow each other; in each the step size falls to zero.
 
-    After a course that made the validation loss worse, the member goes on from the
-    better state with a smaller step size.
-
     Attributes:
-        min_gain: What a course has to gain for another to follow.
+        min_gain: What a course has to gain for another to follow; not negative.
         min_fall: How far the training loss has to fall from the third to the last
             quarter of a course for another to follow.
         max_num: The largest number of courses.
@@ -116,24 +110,16 @@ def fit(
     The starting point competes. Without a hold-out set the last state is kept. A member
     of an ensemble stops by itself, also if its loss is not finite.
 
-    Args:
-        network: A module, or E members whose parameters are stacked. Parameters that
-            require no gradient are left alone, unless none does.
-        batches: Returns the batches of an epoch, given its number. Each part of a batch
-            for an ensemble has the rows of member e at ``part[e]``.
-        loss: Of a batch, the mean loss of each member, ``(E,)``, or of the module.
-            Members that have stopped are not in the batch and in the network any more.
-        training: Learning rate and so on; ``batches`` has the size of the batches.
-        validation_loss: The loss over the hold-out set, if there is one.
-        held_out: The batch that ``validation_loss`` is called with.
-        courses: Whether ``max_num_epochs`` are a course that others may follow, after
-            which the validation loss is computed.
-        learning_rates: One for each member; that of ``training`` if None.
-        max_num_epochs: Instead of that of ``training``.
-        in_training_mode: Whether dropout and batch statistics are active in training.
-        decay: Whether the step size falls to zero, along a cosine over all epochs.
-        label: What the progress bar and warnings call it.
-        show_progress_bars: Whether to show the course of the loss.
+    The network is a module, or E members whose parameters are stacked. Parameters that
+    require no gradient are left alone, unless none does. ``batches`` returns the
+    batches of an epoch, given its number; each part of one has the rows of member e at
+    ``part[e]``. Of a batch, ``loss`` returns the mean loss of each member, ``(E,)``, or
+    of the module, and ``validation_loss`` that of ``held_out``. Members that have
+    stopped are not in the batch and in the network any more.
+
+    With ``courses``, ``max_num_epochs`` are a course that others may follow, after
+    which the validation loss is computed. Dropout and batch statistics are active in
+    training if ``in_training_mode``. With ``decay`` the step size falls along a cosine.
     """
     if not any(parameter.requires_grad for parameter in network.parameters()):
         network.requires_grad_()
@@ -151,7 +137,7 @@ def fit(
     scores: list[list[float]] = [[] for _ in range(E)]
     best = [value.clone() for value in (optimiser.values, *buffers)]
     best_loss = torch.full((E,), math.inf, dtype=torch.double)
-    best_epoch, num_lowered = torch.zeros(2, E, dtype=torch.long)
+    best_epoch = torch.zeros(E, dtype=torch.long)
     # Those that are still trained. The others leave the network, to save their time.
     members, going, num_lost = torch.arange(E), torch.ones(E, dtype=torch.bool), 0
 
@@ -184,14 +170,8 @@ def fit(
         if validation_loss is not None and courses is None:
             going &= epoch - best_epoch[members] < training.stop_after_epochs
         elif courses and epoch and is_over:
-            worse = ~better
-            for kept, value in zip(best, state, strict=True):
-                value[worse] = kept[members[worse]]
-            rates[members[worse]] *= LOWER
-            num_lowered[members[worse]] += 1
-            again = worse & (num_lowered[members] <= MAX_LOWERED)
             fall = torch.tensor([_fall(training_loss[e], length) for e in members])
-            going &= (gain > courses.min_gain) & (fall > courses.min_fall) | again
+            going &= (gain > courses.min_gain) & (fall > courses.min_fall)
             optimiser.restart()
             start, length = epoch, length * courses.growth
         if not going.any():
@@ -315,8 +295,3 @@ def differentiable(module: nn.Module) -> Iterator[None]:
     context = torch.backends.cudnn.flags(enabled=False) if is_slow else nullcontext()
     with torch.enable_grad(), context:
         yield
-
-
-def shuffled(rows: Tensor, size: int) -> Iterator[Tensor]:
-    """Pass over rows in random order, in batches of a size."""
-    yield from rows[torch.randperm(len(rows)).to(rows.device)].split(size)

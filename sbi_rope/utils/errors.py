@@ -8,8 +8,6 @@ import inspect
 import warnings
 from typing import Any
 
-# The most characters of a value that a message shows.
-LONGEST_TEXT = 200
 # Warnings point at no line of these packages.
 PASSED_OVER = ("sbi_rope", "sbi", "torch", "contextlib", "functools")
 
@@ -61,9 +59,7 @@ class RoPEWarning(UserWarning):
 def shown(value: Any) -> str:
     """Return a value as it is written in code, shortened if it is long."""
     text = repr(value)
-    if len(text) <= LONGEST_TEXT:
-        return text
-    return f"{text[:LONGEST_TEXT]}... (of type {type(value).__name__})"
+    return text if len(text) <= 200 else f"{text[:200]}... ({type(value).__name__})"
 
 
 def warn_user(message: str) -> None:

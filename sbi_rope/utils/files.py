@@ -10,8 +10,7 @@ from pathlib import Path
 def write_atomically(path: Path) -> Iterator[Path]:
     """Yield a temporary path, and move the file written there to ``path`` at the end.
 
-    A reader never finds half a file under ``path``, also if another process writes the
-    same file. If ``path`` is a link, what it points to is replaced.
+    If ``path`` is a link, what it points to is replaced.
     """
     path = path.resolve()
     # Files made by `mkstemp` can be read by their owner only.

@@ -14,9 +14,8 @@ from sbi_rope.utils.settings import Seed, check
 def seeded(seed: int | None) -> Iterator[None]:
     """Run a block with its own random numbers, or with the caller's if seed is None.
 
-    These are those of the global generators of torch, NumPy and Python, from which sbi
-    and most simulators draw; their states are restored after the block. Blocks can be
-    nested, but not run in several threads at once.
+    The global generators of torch, NumPy and Python, from which sbi and most simulators
+    draw, get their states back after the block. It must not run in several threads.
     """
     check("seed", seed, Seed)
     if seed is None:

@@ -47,12 +47,6 @@ def check(name: str, value: Any, kind: Any) -> None:
 
     A hint is a class, a ``Literal``, a number with a :class:`Range`, a ``Sequence`` of
     such, or a union.
-
-    Example:
-        >>> check("tau", 2, UnitInterval)
-        Traceback (most recent call last):
-        sbi_rope.utils.errors.InvalidInputError: Expected `tau` to be a number from \
-0 to 1; got 2.
     """
     if not _fits(value, kind):
         raise InvalidInputError(

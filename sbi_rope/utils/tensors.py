@@ -24,17 +24,9 @@ def as_batch(
     """Return a user's data as a tensor of shape ``(n, *event_shape)``.
 
     It has no gradients. A floating-point tensor keeps its dtype, and all else becomes
-    float32.
-
-    Args:
-        name: What the argument is called.
-        value: A tensor, an array, a table, or a list of numbers.
-        event_shape: The shape of one row; any if None.
-        rows: The number of rows; any if None.
-        device: Where the tensor has to be, and where arrays and lists are moved.
-        names: Names of columns. A table that has them in another order is put in order.
-        finite: Whether NaN and Inf are errors.
-        empty: Whether n may be 0.
+    float32. A tensor has to be on the ``device``, where arrays and lists are moved. A
+    table with the columns ``names`` in another order is put in order. Unless they are
+    None, the shape of a row and the number of rows are checked.
     """
     numbers = as_numbers(name, value, device=device, names=names)
     shape = tuple(numbers.shape)

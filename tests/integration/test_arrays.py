@@ -9,8 +9,7 @@ from torch import Tensor
 
 from sbi_rope import RoPE
 from sbi_rope.methods import FinetunedNPE
-from sbi_rope.methods.training import Training
-from sbi_rope.metrics import draw_samples, evaluate
+from sbi_rope.metrics import evaluate
 from tests import gaussian, problems
 from tests.stacks import NPE, PRIOR, QUICK, QUIET, problem, stacked
 
@@ -35,12 +34,9 @@ def test_pairs_and_observations_are_those_of_tensors(convert: Any) -> None:
     log_prob = posterior.log_prob_batched(theta_o, x=x_o)
     assert torch.allclose(log_prob.float(), posterior.log_prob_batched(*OBSERVED))
     assert posterior.sample((3,), x=x_o[1]).shape == (3, 2)
-    assert posterior.sample_batched((3,), x=x_o, **QUIET).shape == (3, 25, 2)
-    for scored in (posterior, npe):
-        scores = evaluate(scored, theta_o, x_o, num_samples=20, seed=0, **QUIET)
-        expected = evaluate(scored, *OBSERVED, num_samples=20, seed=0, **QUIET)
-        assert scores.as_row() == pytest.approx(expected.as_row(), nan_ok=True)
-        assert draw_samples(scored, x_o, num_samples=3).shape == (3, 25, 2)
+    scores = evaluate(npe, theta_o, x_o, num_samples=20, seed=0, **QUIET)
+    expected = evaluate(npe, *OBSERVED, num_samples=20, seed=0, **QUIET)
+    assert scores.as_row() == pytest.approx(expected.as_row(), nan_ok=True)
 
 
 @pytest.mark.medium
@@ -58,17 +54,13 @@ def test_a_table_is_put_in_the_order_of_the_first_one() -> None:
     assert torch.equal(rope.pairs.y, torch.cat([theta, theta]))
     assert torch.equal(rope.pairs.x, torch.cat([x, x]))
     assert torch.allclose(rope.pairs.std.float(), torch.tensor([0.1, 0.2]))
-    options: Any = {"training": Training(max_num_epochs=1), "num_holdouts": 2}
-    method = FinetunedNPE.from_posterior(gaussian.posterior(), **options)
+    method = FinetunedNPE.from_posterior(gaussian.posterior())
     method.append_calibration(first, x_first).append_calibration(second, x_second)
-    tuned = method.train(seed=0, **QUIET).build_posterior()
-    stack = stacked(rope, candidates=[PRIOR, NPE], num_folds=2)
-    for posterior in (tuned, stack):
-        expected = posterior.log_prob_batched(theta, x)
-        assert torch.equal(posterior.log_prob_batched(second, x_second), expected)
-        found = posterior.log_prob(second, x_second.iloc[0])  # a row is a series
-        assert torch.equal(found, posterior.log_prob(theta, x[0]))
-        found_set = posterior.credible_set(0.5, x_second.iloc[0], seed=0)
-        drawn = table(theta, "ab")[["b", "a"]]
-        inside = found_set.contains(theta)
-        assert torch.equal(found_set.contains(drawn), inside)
+    assert torch.equal(method._data.pairs.x, rope.pairs.x)
+    posterior = stacked(rope, candidates=[PRIOR, NPE], num_folds=2)
+    expected = posterior.log_prob_batched(theta, x)
+    assert torch.equal(posterior.log_prob_batched(second, x_second), expected)
+    found = posterior.log_prob(second, x_second.iloc[0])  # a row is a series
+    assert torch.equal(found, posterior.log_prob(theta, x[0]))
+    found_set = posterior.credible_set(0.5, x_second.iloc[0], seed=0)
+    assert torch.equal(found_set.contains(second), found_set.contains(theta))

@@ -20,14 +20,12 @@ from sbi_rope import (
     CalibrationFinetuner,
     RoPE,
     SinkhornCoupler,
-    baselines,
     diagnose,
     metrics,
     stack,
 )
 from sbi_rope.methods import DiscrepancyNPE
 from sbi_rope.stacking import default_candidates
-from sbi_rope.tasks import get_task
 from sbi_rope.utils.errors import RoPEError
 from tests import gaussian
 
@@ -47,9 +45,6 @@ X, X_S = 1.4 * (THETA + 0.5 * draw(2, 20, 2)) + 0.7, THETA_S + 0.5 * draw(3, 60,
 ONES = torch.ones(20, 2)
 
 
-# --- objects that are made once ---
-
-
 @functools.cache
 def npe() -> Any:
     return DirectPosterior(gaussian.GaussianEstimator(), PRIOR)
@@ -66,32 +61,9 @@ def trained() -> RoPE:
 
 
 @functools.cache
-def coupled() -> Any:
-    return trained().build_posterior(X_O, num_simulations=30, seed=0)
-
-
-@functools.cache
 def stacked() -> Any:
     candidates = [c for c in default_candidates() if c.name in ("prior", "NPE")]
     return stack(trained(), candidates=candidates, num_folds=2, seed=0)
-
-
-# --- the public calls, each with good tensors as defaults ---
-
-
-def of_posterior(kind: str, make: Callable[[], Any]) -> dict[str, Call]:
-    drawn = {"num_samples": 20, "seed": 0}
-    return {
-        f"{kind}.sample": lambda x=X_O[:1]: make().sample((5,), x=x),
-        f"{kind}.log_prob": lambda theta=THETA, x=X_O[:1]: make().log_prob(theta, x=x),
-        f"{kind}.log_prob_batched": lambda theta=THETA, x=X_O: make().log_prob_batched(
-            theta, x=x
-        ),
-        f"{kind}.credible_set": lambda x=X_O: make().credible_set(0.9, x, **drawn),
-        f"{kind}.credible_set.contains": lambda theta=THETA: (
-            make().credible_set(0.9, X_O[0], **drawn).contains(theta)
-        ),
-    }
 
 
 def with_simulations(theta: Tensor = THETA_S, x: Tensor = X_S) -> Tensor:
@@ -99,6 +71,8 @@ def with_simulations(theta: Tensor = THETA_S, x: Tensor = X_S) -> Tensor:
     return rope.embed(X_O, seed=0)[3]
 
 
+DRAWN: Any = {"num_samples": 20, "seed": 0}
+# The public calls, each with good tensors as defaults.
 CALLS: dict[str, Call] = {
     "RoPE": with_simulations,
     "RoPE.append_calibration": lambda theta=THETA, x=X: (
@@ -111,25 +85,25 @@ CALLS: dict[str, Call] = {
         untrained().append_calibration(THETA, X, weights=weights)
     ),
     "RoPE.build_posterior": lambda x_o=X_O: trained().build_posterior(x_o),
-    "SinkhornCoupler.couple": SinkhornCoupler().couple,
+    "SinkhornCoupler.couple": lambda real=X_O, simulated=X_S: SinkhornCoupler().couple(
+        real, simulated
+    ),
     "stack": lambda x_o=X_O: stack(trained(), x_o),
     "diagnose": lambda x_o=X_O: diagnose(trained(), x_o, num_folds=None),
-    **of_posterior("MixturePosterior", coupled),
-    **of_posterior("StackedPosterior", stacked),
+    "sample": lambda x=X_O[:1]: stacked().sample((5,), x=x),
+    "log_prob": lambda theta=THETA, x=X_O[:1]: stacked().log_prob(theta, x=x),
+    "log_prob_batched": lambda theta=THETA, x=X_O: stacked().log_prob_batched(theta, x),
+    "credible_set": lambda x=X_O: stacked().credible_set(0.9, x, **DRAWN),
+    "contains": lambda theta=THETA: (
+        stacked().credible_set(0.9, X_O[0], **DRAWN).contains(theta)
+    ),
     "evaluate": lambda theta=THETA, x=X: metrics.evaluate(stacked(), theta, x),
-    "method.append_simulations": lambda theta=THETA_S, x=X_S: (
-        DiscrepancyNPE(PRIOR).append_simulations(theta, x)._data.simulations[1]
-    ),
     "method.append_calibration": lambda theta=THETA, x=X: (
-        DiscrepancyNPE(PRIOR).append_calibration(theta, x)._data.calibration[1]
+        DiscrepancyNPE(PRIOR)
+        .append_simulations(THETA_S, X_S)
+        .append_calibration(theta, x)
     ),
-    "method.append_observations": lambda x_o=X_O: baselines.RVNP(
-        PRIOR
-    ).append_observations(x_o),
 }
-
-
-# --- the bad inputs ---
 
 
 def spoilt(good: Tensor, value: float) -> Tensor:
@@ -149,44 +123,29 @@ BAD: dict[str, Callable[[Tensor], Any]] = {
 }
 
 
-def finite(found: Any) -> bool:
-    return bool(torch.isfinite(torch.as_tensor(found)).all())
-
-
-def shape(*sizes: int) -> Callable[[Tensor], bool]:
-    return lambda found: tuple(found.shape) == sizes
-
-
-# What some bad inputs mean to some calls, as a condition on the result.
+# What some bad inputs mean to some calls, as a condition on the result: a missing label
+# is imputed, a simulation is dropped, or a parameter is impossible.
 MEANS: dict[str, Callable[[Any], bool]] = {
-    # A parameter that was not measured is imputed.
-    "RoPE.append_calibration(theta: NaN)": finite
+    "RoPE.append_calibration(theta: NaN)": lambda found: bool(found.isfinite().all()),
+    **{
+        f"RoPE({name}: {bad})": lambda found: found.shape == (59, 2)
+        for name, bad in itertools.product(("theta", "x"), ("NaN", "Inf"))
+    },
+    **{
+        f"{name}(theta: Inf)": lambda found: int(found.isneginf().sum()) == 1
+        for name in ("log_prob", "log_prob_batched")
+    },
 }
-for _name in CALLS:
-    if "log_prob" in _name:  # one of the parameters is impossible
-        MEANS[f"{_name}(theta: Inf)"] = lambda found: int(found.isneginf().sum()) == 1
-    for _bad in ("NaN", "Inf"):
-        if _name == "RoPE":  # a simulation is dropped
-            MEANS[f"RoPE(theta: {_bad})"] = MEANS[f"RoPE(x: {_bad})"] = shape(59, 2)
-        if _name.endswith("append_simulations"):
-            MEANS[f"{_name}(x: {_bad})"] = shape(59, 2)
-    if ".append_" in _name and not _name.startswith("RoPE"):
-        # The first x says which shape an observation has.
-        for _argument, _bad in itertools.product(("x", "x_o"), ("ndim", "width")):
-            MEANS[f"{_name}({_argument}: {_bad})"] = lambda found: True
 
 
 def good_tensors(call: Call) -> dict[str, Tensor]:
-    found = {n: p.default for n, p in inspect.signature(call).parameters.items()}
-    found |= {"real": X_O, "simulated": X_S} if "real" in found else {}
-    return {name: good for name, good in found.items() if isinstance(good, Tensor)}
+    return {n: p.default for n, p in inspect.signature(call).parameters.items()}
 
 
 def verdict(name: str, argument: str, label: str, bad: Any) -> str:
     """What a call does wrong with a bad argument; nothing if it refuses it by name."""
     good = good_tensors(CALLS[name])
-    case = f"{name}({argument}: {label})"
-    means = MEANS.get(case)
+    means = MEANS.get(f"{name}({argument}: {label})")
     try:
         found = CALLS[name](**{**good, argument: bad})
     except RoPEError as error:
@@ -210,18 +169,12 @@ def test_a_bad_tensor_is_refused_or_means_something(name: str, argument: str) ->
         assert not wrong, label
 
 
-# --- settings ---
-
-
 SETTINGS: dict[str, Callable[..., Any]] = {
-    "num_simulations": lambda **bad: untrained(**bad),
     "gamma": SinkhornCoupler,
-    "tau": SinkhornCoupler,
     "num_folds": lambda **bad: stack(trained(), **bad),
     "seed": lambda **bad: trained().build_posterior(X_O, **bad),
     "level": lambda **bad: stacked().credible_set(x=X_O[0], **bad),
     "num_samples": lambda **bad: metrics.evaluate(stacked(), THETA, X, **bad),
-    "n": lambda **bad: get_task("pendulum").get_calibration_set(**bad, seed=0),
 }
 
 

@@ -1,10 +1,12 @@
 """Missing trials (NaN) are accepted where the embedding net leaves them out."""
 
+from functools import partial
+
 import pytest
 import torch
 from torch import Tensor
 
-from sbi_rope import RoPE, diagnose
+from sbi_rope import RoPE
 from sbi_rope.methods import DiscrepancyNPE, FinetunedNPE
 from sbi_rope.methods.training import Training
 from sbi_rope.metrics import draw_samples, evaluate
@@ -41,12 +43,8 @@ def test_rope_repairs_a_posterior_of_trials_some_of_which_are_missing() -> None:
     assert trained.source.num_dropped == 0
     assert is_finite(posterior, theta_o, x_o)
     # The observation is known again by its values, those missing included.
-    alone = posterior[3]
-    assert torch.allclose(alone.weights[0], posterior.weights[3])
-    assert alone.sample((5,), **QUIET).isfinite().all()
     expected = posterior.log_prob_batched(theta_o[3:4], x=x_o[3:4])[0]
-    assert torch.allclose(alone.log_prob(theta_o[3:4]), expected)
-    assert torch.allclose(posterior.log_prob(theta_o[3:4], x=x_o[3]), expected)
+    assert torch.allclose(posterior[3].log_prob(theta_o[3:4]), expected)
 
 
 @pytest.mark.slow
@@ -54,15 +52,8 @@ def test_a_stack_takes_trials_some_of_which_are_missing() -> None:
     theta_o, x_o = labelled(20)
     names = ("NPE", "fine-tuned NPE", "discrepancy (tuned)")
     chosen = [c for c in default_candidates() if c.name in names]
-    assert len(chosen) == len(names)
     posterior = stacked(rope(), candidates=chosen, num_folds=3)
     assert is_finite(posterior, theta_o, x_o)
-
-
-@pytest.mark.slow
-def test_diagnosis_takes_trials_some_of_which_are_missing() -> None:
-    diagnosis = diagnose(rope().train(**QUIET), labelled(40)[1], **QUIET)
-    assert "batch" in str(diagnosis)
 
 
 def test_trainers_that_start_from_a_posterior_take_missing_trials() -> None:
@@ -94,12 +85,7 @@ def test_a_net_that_counts_the_trials_of_another_row_is_refused() -> None:
     theta, x = labelled(10)
     # With no trial missing, its embeddings are right.
     rope.append_calibration(theta, x.nan_to_num(0.5))
-    for call in (
-        lambda: rope.append_calibration(theta, x),
-        lambda: rope.npe.as_x("x_o", x),
-        lambda: evaluate(npe, theta, x),
-        lambda: FinetunedNPE.from_posterior(npe).append_calibration(theta, x),
-    ):
+    for call in (rope.append_calibration, partial(evaluate, npe)):
         match = "embedding of a row alone than in a batch"
         with pytest.raises(UnsupportedPosteriorError, match=match):
-            call()
+            call(theta, x)

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from sbi_rope.density import Flow
 from sbi_rope.npe.sbi import embedding_of, estimator_of, headless
 from sbi_rope.tasks.networks import SeriesEmbedding
-from sbi_rope.training.ensemble import Ensemble, drawn, embedded, log_density
+from sbi_rope.training.ensemble import Ensemble, embedded
 from sbi_rope.training.fit import Training, fit
 from tests import problems
 
@@ -25,33 +25,25 @@ ALONE: Any = {"label": "", "show_progress_bars": False}
 NUM_MEMBERS, NUM_ROWS = 3, 12
 
 
-class Transposed(nn.Module):
+class Transposed(nn.Linear):
     """Puts another dimension first, so that rows of members mix up."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.net = nn.Linear(2, 4)
-
     def forward(self, x: Tensor) -> Tensor:
-        return self.net(x.transpose(0, 1)).sum(dim=0)
+        return super().forward(x.transpose(0, 1)).sum(dim=0)
 
 
-class Recurrent(nn.Module):
+class Recurrent(nn.GRU):
     """The last state of a GRU."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.gru = nn.GRU(2, 4, batch_first=True)
-
     def forward(self, x: Tensor) -> Tensor:
-        return self.gru(x)[1][0]
+        return super().forward(x)[1][0]
 
 
 NETS: dict[str, tuple[Callable[[], nn.Module], tuple[int, ...]]] = {
     "linear": (lambda: nn.Sequential(nn.Linear(3, 4), nn.Tanh()), (3,)),
     "fully connected": (lambda: FCEmbedding(3, output_dim=4, num_hiddens=8), (3,)),
     "conv": (problems.SmallCNN, (1, 8, 8)),
-    "recurrent": (Recurrent, (5, 2)),
+    "recurrent": (lambda: Recurrent(2, 4, batch_first=True), (5, 2)),
     "sets": (
         lambda: PermutationInvariantEmbedding(
             nn.Linear(2, 4), 4, num_hiddens=8, output_dim=4
@@ -59,7 +51,7 @@ NETS: dict[str, tuple[Callable[[], nn.Module], tuple[int, ...]]] = {
         (5, 2),
     ),
     "trials": (problems.TrialsNet, (4, 2)),
-    "transposed": (Transposed, (5, 2)),
+    "transposed": (lambda: nn.Sequential(Transposed(2, 4)), (5, 2)),
     "series": (lambda: SeriesEmbedding(num_steps=80, output_dim=4), (80,)),
 }
 FAMILIES = problems.FAMILIES
@@ -148,38 +140,21 @@ def test_every_embedding_net_is_trained_at_once_as_alone(name: str) -> None:
     check_as_trained_alone(estimator_behind(name))
 
 
-@pytest.mark.parametrize("family", ["mdn", "nsf", "zuko_nsf", "mnpe"])
-def test_draws_of_each_member_are_those_of_its_density(family: str) -> None:
-    each = members(headless(estimator_of(problems.npe_posterior(family))))
-    z = torch.randn(1, each[0].condition_shape[0]).expand(NUM_MEMBERS * 400, -1)
-    ensemble = Ensemble(each, log_density, (drawn(each[0], z[:3]), z[:3]))
-    draws = ensemble.answer(drawn, z).unflatten(0, (NUM_MEMBERS, 400))
-    for of_member, alone in zip(draws, each, strict=True):
-        expected = alone.sample(torch.Size((400,)), z[:1])[:, 0]
-        error = (of_member.var(dim=0) + expected.var(dim=0)).div(400).sqrt()
-        difference = (of_member.mean(dim=0) - expected.mean(dim=0)).abs()
-        assert (difference < 4.5 * error + 1e-6).all()
-
-
-@pytest.mark.parametrize("name", ["linear", "transposed", "conv", "recurrent"])
+@pytest.mark.parametrize("name", ["linear", "transposed", "recurrent"])
 def test_members_can_be_moved_taken_out_and_joined(name: str) -> None:
     make, shape = NETS[name]
     each = members(make())
     x = torch.randn(5, *shape)
     ensemble = Ensemble(each, embedded, (x,)).double().float()
-    for number, net in enumerate(each):
-        assert torch.allclose(ensemble.member(number)(x), net(x), atol=1e-5)
     some = ensemble[[2, 0]]
-    found = some.answer(embedded, torch.cat([x, x]))
-    expected = torch.cat([each[2](x), each[0](x)])
-    assert len(some) == 2
-    assert torch.allclose(found, expected, atol=1e-5)
     both = Ensemble.joined([some, ensemble])
-    assert len(both) == 5
+    assert (len(some), len(both)) == (2, 5)
     found = both.answer(embedded, x.repeat(5, *[1] * (x.ndim - 1))).chunk(5)
-    for of_member, number in zip(found, (2, 0, 0, 1, 2), strict=True):
-        assert torch.allclose(of_member, each[number](x), atol=1e-5)
     with torch.no_grad():  # copies
         for weight in some.parameters():
             weight.zero_()
-    assert torch.allclose(ensemble.member(2)(x), each[2](x), atol=1e-5)
+    for place, number in enumerate((2, 0, 0, 1, 2)):
+        expected = each[number](x)
+        assert torch.allclose(found[place], expected, atol=1e-5)
+        assert torch.allclose(both.member(place)(x), expected, atol=1e-5)
+        assert torch.allclose(ensemble.member(number)(x), expected, atol=1e-5)

@@ -4,7 +4,6 @@ import math
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import pytest
 import torch
@@ -56,9 +55,6 @@ def rope(dim: int = 2, **options: Any) -> RoPE:
     return RoPE(gaussian.posterior(dim), simulator=gaussian.simulator, **options)
 
 
-# Draws and densities ------------------------------------------------------------------
-
-
 def test_draws_of_parameters_follow_the_prior_given_the_label() -> None:
     found = draws_of(LABELS, PRIOR).double()
     assert found.shape == (4, 100, 3)
@@ -94,8 +90,7 @@ def test_draws_stay_inside_a_box() -> None:
 def test_given_draws_come_in_random_order() -> None:
     ordered = torch.randn(2, 40, 2).sort(dim=1).values
     draws = rope().append_calibration(ordered, torch.randn(2, 2)).pairs.theta
-    away = (draws[:, :10].mean(dim=1) - ordered.mean(dim=1)).abs().max()
-    assert float(away) < 1.0
+    assert not torch.equal(draws, ordered)
     assert torch.equal(draws.sort(dim=1).values, ordered)
 
 
@@ -107,28 +102,14 @@ def test_the_density_of_a_label_is_that_of_the_posterior_with_its_noise() -> Non
     samples = q.sample(torch.Size((200, 1))).expand(-1, 4, -1)
     nodes = nodes_of(LABELS, [samples], PRIOR, num_nodes=2000)
     log_q = q.log_prob(nodes.theta.double())
-    found, error = nodes.log_mean(log_q), nodes.standard_error(log_q)
+    found = nodes.log_mean(log_q)
     for i in range(4):
         known = LABELS.is_measured[i].nonzero().flatten()
         exact = MultivariateNormal(
             mean[known], (covariance + STD[i].square().diag())[known][:, known]
         ).log_prob(Y[i, known].double())
-        assert abs(float(found[i] - exact)) < 4 * float(error[i]) + 1e-6
-        assert float(error[i]) < 0.1
-    assert float(error[3]) == 0.0  # of an exact label there is nothing to estimate
-
-
-@pytest.mark.parametrize("smallest", [1e-3, 1e-7])
-def test_parameters_may_be_known_with_very_different_precision(smallest: float) -> None:
-    y = torch.tensor([[0.3, -0.2]])
-    q = MultivariateNormal(torch.zeros(2).double(), 0.3 * torch.eye(2).double() + 0.1)
-    torch.manual_seed(0)
-    samples = [q.sample(torch.Size((200, 1)))]
-    nodes = nodes_of(measured(y, smallest, 0.1), samples, box(2), num_nodes=2000)
-    found = nodes.log_mean(q.log_prob(nodes.theta.double()))
-    noise = torch.tensor([smallest, 0.1]).double().square().diag()
-    exact = MultivariateNormal(q.mean, q.covariance_matrix + noise).log_prob(y.double())
-    assert abs(float(found - exact)) < 0.05
+        # Of the exact label there is nothing to estimate.
+        assert abs(float(found[i] - exact)) < (0.15 if i < 3 else 1e-6)
 
 
 def log_evidence(y: float, std: float) -> float:
@@ -178,9 +159,6 @@ def test_ranks_of_noisy_labels_are_uniform_if_the_posterior_is_right() -> None:
         assert kstest(uniform.numpy(), "uniform").pvalue > 0.01
 
 
-# Learning -----------------------------------------------------------------------------
-
-
 def line(theta: Tensor) -> Tensor:
     return torch.stack([theta[:, 0] + theta[:, 1], theta[:, 1].square()], dim=1)
 
@@ -215,26 +193,6 @@ def test_the_possible_means_are_shrunk_by_the_noise_in_them_only() -> None:
     assert float(error.square().mean()) < 0.06 * gaussian.NOISE_STD**2
 
 
-@pytest.mark.medium
-def test_the_discrepancy_of_possible_means_is_that_of_the_right_ones() -> None:
-    torch.manual_seed(0)
-    m = torch.randn(60, 1, dtype=torch.double)
-    z = 0.5 * m + 2.0 + 0.05 * torch.randn(60, 1).double()
-    noise = torch.tensor([[1e-4]]).double()
-    # The right mean is one of two, and the observation tells which.
-    possible = torch.stack([m, torch.randn(60, 1).double()], dim=1)
-    exact, single, found, naive = (
-        DiscrepancyModel().fit(z, means, noise).sample(500, seed=0)
-        for means in (m, m[:, None], possible, possible.mean(dim=1))
-    )
-    assert torch.equal(single.gain, exact.gain)
-    assert abs(float(exact.gain.mean()) - 0.5) < 0.02
-    assert abs(float(found.gain.mean()) - 0.5) < 0.05
-    assert abs(float(found.offset.mean()) - 2.0) < 0.05
-    error = [float(one.error_factor.square().mean().sqrt()) for one in (found, naive)]
-    assert error[0] < 0.5 * error[1]
-
-
 def test_a_weight_of_two_counts_as_two_pairs() -> None:
     torch.manual_seed(1)
     m = torch.randn(6, 2, dtype=torch.double)
@@ -251,18 +209,10 @@ def test_a_weight_of_two_counts_as_two_pairs() -> None:
     assert torch.allclose(one, other, atol=1e-6)
 
 
-def half_measured(count: int) -> tuple[Tensor, Tensor]:
-    """Return pairs of which each has one parameter."""
-    torch.manual_seed(0)
-    theta, x = gaussian.labelled(count)
-    theta[::2, 0] = NAN
-    theta[1::2, 1] = NAN
-    return theta, x
-
-
 @pytest.mark.medium
 def test_tuning_on_partial_labels_keeps_what_x_says_about_missing_parameters() -> None:
-    theta, x = half_measured(600)
+    theta, x = gaussian.labelled(600)
+    theta[::2, 0] = theta[1::2, 1] = NAN
     finetuner = CalibrationFinetuner(learning_rate=1e-2, max_num_epochs=300)
     conductor = rope(finetuner=finetuner).append_calibration(theta, x)
     conductor.train(seed=0, show_progress_bars=False)
@@ -273,16 +223,6 @@ def test_tuning_on_partial_labels_keeps_what_x_says_about_missing_parameters() -
     slope = gaussian.GAIN**2 / gaussian.SCALE
     expected = slope * torch.eye(2)
     assert torch.allclose(torch.stack(moved) - level, expected, atol=0.15 * slope)
-
-
-# What users pass ----------------------------------------------------------------------
-
-
-def test_labels_that_say_nothing_are_refused() -> None:
-    theta, x = gaussian.labelled(6)
-    theta[2:4] = NAN
-    with pytest.raises(InvalidInputError, match="NaN only in 2 of 6 rows"):
-        rope().append_calibration(theta, x)
 
 
 @pytest.mark.medium
@@ -303,6 +243,8 @@ def test_exact_and_noisy_labels_may_be_appended_one_after_the_other() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        ({"theta": torch.full((10, 2), NAN)}, "NaN only in 10 of 10 rows"),
+        ({"theta": torch.full((10, 2), 90.0)}, r"fit; got others in 10 of 10 rows"),
         ({"theta_std": -0.1}, "not to be negative"),
         ({"theta_std": torch.ones(3)}, r"\(10, 2\); got \(3,\)"),
         ({"weights": torch.zeros(10)}, "positive"),
@@ -312,36 +254,21 @@ def test_exact_and_noisy_labels_may_be_appended_one_after_the_other() -> None:
 def test_labels_that_make_no_sense_are_refused(
     options: dict[str, Any], message: str
 ) -> None:
-    conductor = rope()
-    with pytest.raises(InvalidInputError, match=message):
-        conductor.append_calibration(*gaussian.labelled(10), **options)
-    assert not len(conductor.pairs)
-
-
-def test_a_label_that_fits_no_parameters_of_the_prior_is_named() -> None:
     npe = DirectPosterior(gaussian.GaussianEstimator(), box(2))
-    theta = torch.tensor([[0.0, 0.0], [0.5, 90.0]])
-    with pytest.raises(InvalidInputError, match=r"fit; got others in 1 of 2 .*\[1\]"):
-        RoPE(npe, simulator=gaussian.simulator).append_calibration(
-            theta, theta, theta_std=0.1
-        )
+    good = {"theta": torch.zeros(10, 2), "x": torch.zeros(10, 2), "theta_std": 0.1}
+    with pytest.raises(InvalidInputError, match=message):
+        RoPE(npe, simulator=gaussian.simulator).append_calibration(**good | options)
 
 
 def test_groups_are_numbers_or_names_of_all_pairs() -> None:
     theta, x = gaussian.labelled(4)
-    table = pd.DataFrame({"specimen": ["a", "a", "b", "c"]})
-    for groups in (
-        table["specimen"],
-        np.array([7, 7, 2, 3]),
-        torch.tensor([7, 7, 2, 3]),
-    ):
+    for groups in (pd.Series(["a", "a", "b", "c"]), torch.tensor([7, 7, 2, 3])):
         named = rope().append_calibration(theta, x, groups=groups)
         assert named.pairs.group.tolist() == [0, 0, 1, 2]
     named = named.append_calibration(theta, x, groups=["mouse", 2, "rat", "mouse"])
     assert named.pairs.group.tolist() == [0, 0, 1, 2, 3, 1, 4, 3]
     with pytest.raises(InvalidInputError, match="or of none"):
         named.append_calibration(theta, x)
-    assert len(named.pairs) == 8
 
 
 def test_weights_that_were_normalised_are_warned_of() -> None:

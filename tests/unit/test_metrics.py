@@ -15,7 +15,6 @@ from torch.distributions import Normal
 from sbi_rope import metrics
 from sbi_rope.metrics import Estimate, Evaluation
 from sbi_rope.metrics.evaluation import NOMINAL, estimates_and_ranks, verdict_of
-from sbi_rope.npe.sbi import BaseDirectPosterior
 from sbi_rope.utils.errors import InvalidInputError
 from tests import gaussian
 from tests.refusals import assert_refused
@@ -383,10 +382,10 @@ def test_a_seed_fixes_the_samples_and_leaves_the_global_random_state_alone() -> 
 # Posteriors of sbi --------------------------------------------------------------------
 
 
-def far_posterior(kind: type[DirectPosterior] = DirectPosterior) -> Any:
+def far_posterior() -> Any:
     """An NPE whose prior is far from all that it draws."""
     far = BoxUniform(torch.full((2,), 100.0), torch.full((2,), 101.0))
-    return kind(gaussian.GaussianEstimator(), far)
+    return DirectPosterior(gaussian.GaussianEstimator(), far)
 
 
 X_O = torch.tensor([[0.5, -1.0], [2.0, 0.0]])
@@ -410,20 +409,6 @@ def test_log_probs_of_an_npe_are_those_of_its_network_inside_the_prior() -> None
     assert torch.allclose(found.log_prob, raw.detach().double(), rtol=1e-5)
     assert moved.log_prob.isneginf().all()
     assert "100.0% of the true parameters have density zero" in str(moved)
-
-
-def test_a_posterior_with_bounded_rejection_is_called_as_it_is() -> None:
-    class Bounded(BaseDirectPosterior):
-        def sample_batched(self, sample_shape: Any, x: Tensor, **options: Any) -> Any:
-            assert set(options) == {"show_progress_bars"}
-            return torch.rand(*sample_shape, len(x), 2)
-
-        def log_prob_batched(self, theta: Tensor, x: Tensor, **options: Any) -> Any:
-            assert options == {}
-            return torch.zeros(theta.shape[:-1]).reshape(-1, len(x))
-
-    found = metrics.evaluate(far_posterior(Bounded), X_O, X_O, num_samples=20)
-    assert found.lpp.mean == 0.0
 
 
 # Errors -------------------------------------------------------------------------------

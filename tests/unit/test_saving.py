@@ -9,20 +9,20 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 import torch
 from sbi.inference import VIPosterior
 from torch import Tensor, nn
 
-from sbi_rope import MixturePosterior, StackedPosterior, load, save
-from sbi_rope.density import Flow, PriorPosterior
+from sbi_rope import load, save
+from sbi_rope.density import PriorPosterior
 from sbi_rope.stacking import DiscrepancyCandidate, FinetunedCandidate
 from sbi_rope.tasks.distributions import UniformTriangle
 from sbi_rope.tasks.hemodynamics.prior import PopulationPrior
 from sbi_rope.utils.errors import DataNotFoundError, FileFormatError
 from tests import problems, stacks
-from tests.baselines import data_of, trained
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*lie outside the prior support")
 
@@ -30,37 +30,15 @@ QUIET = {"show_progress_bars": False}
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def mixture_of(posterior: Any) -> MixturePosterior:
-    """Return a mixture of one part, for any x."""
-    estimator = Flow.of([posterior.posterior_estimator])
-    return MixturePosterior(estimator, posterior.prior)
-
-
-def rope_posterior(**options: Any) -> MixturePosterior:
-    rope = stacks.rope_of().train(seed=0, **QUIET)
-    return rope.build_posterior(stacks.observed(), seed=0, **options, **QUIET)
-
-
-@functools.cache
-def small_stack() -> StackedPosterior:
-    """Return a stack of few candidates, for reading only."""
-    trained_ones = (DiscrepancyCandidate(space="tuned"), FinetunedCandidate())
-    candidates = [stacks.PRIOR, stacks.NPE, *trained_ones, stacks.BOX]
-    with torch.random.fork_rng():
-        return stacks.stacked(stacks.rope_of(), candidates=candidates, num_folds=3)
-
-
-def numbers(posterior: Any, x: Tensor, *, truncated: bool = True) -> list[Tensor]:
+def numbers(posterior: Any, x: Tensor) -> list[Tensor]:
     """Samples with a seed, and log densities."""
-    options: tuple[Any, Any] = ({}, {})
-    if not truncated:
-        options = {"reject_outside_prior": False}, {"norm_posterior": False}
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        samples = posterior.sample_batched((3,), x, **QUIET, **options[0])
+    # The mass inside the prior takes draws, which some families search for.
+    torch.manual_seed(0)
+    samples = posterior.sample_batched((3,), x, reject_outside_prior=False, **QUIET)
     if not hasattr(posterior, "log_prob_batched"):
         return [samples]
-    return [samples, posterior.log_prob_batched(samples, x, **options[1]).detach()]
+    options = {"norm_posterior": False}
+    return [samples, posterior.log_prob_batched(samples, x, **options).detach()]
 
 
 def saved_and_loaded(posterior: Any, folder: Path, **options: Any) -> Any:
@@ -68,13 +46,10 @@ def saved_and_loaded(posterior: Any, folder: Path, **options: Any) -> Any:
     return load(folder / "posterior.pt", **options)
 
 
-def assert_same(posterior: Any, loaded: Any, x: Tensor, **options: Any) -> None:
+def assert_same_again(posterior: Any, x: Tensor, folder: Path) -> None:
+    loaded = saved_and_loaded(posterior, folder)
     assert type(loaded) is type(posterior)
-    found, expected = (numbers(one, x, **options) for one in (loaded, posterior))
-    assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
-
-
-# --- what is loaded is what was saved ---
+    assert all(map(torch.equal, numbers(loaded, x), numbers(posterior, x)))
 
 
 FRESH = """
@@ -83,9 +58,10 @@ for file in sorted(pathlib.Path(sys.argv[1]).glob("*.pt")):
     posterior = sbi_rope.load(file)
     x, samples, log_prob = torch.load(file.with_suffix(".expected"), weights_only=True)
     torch.manual_seed(0)
-    found = posterior.sample_batched((3,), x, show_progress_bars=False)
+    found = posterior.sample_batched((3,), x, reject_outside_prior=False)
     assert torch.equal(found, samples), file
-    assert torch.equal(posterior.log_prob_batched(found, x).detach(), log_prob), file
+    found = posterior.log_prob_batched(samples, x, norm_posterior=False)
+    assert torch.equal(found.detach(), log_prob), file
     print(type(posterior).__name__, getattr(posterior, "report", "-"))
 assert not [name for name in sys.modules if name.split(".")[0] == "tests"]
 """
@@ -93,16 +69,12 @@ assert not [name for name in sys.modules if name.split(".")[0] == "tests"]
 
 @pytest.mark.medium
 def test_another_process_loads_the_same_posteriors(tmp_path: Path) -> None:
-    batch, stack = rope_posterior(), small_stack()
-    tuned = trained("finetuned_npe_averaged", "linear_gaussian").build_posterior()
-    x_o = stacks.observed()
-    cases = [
-        (batch, x_o[:5]),
-        (batch[3], x_o[3:4]),
-        (stack, x_o[:4]),
-        (tuned, data_of("linear_gaussian").x_o[:3]),
-        (PriorPosterior(problems.box(2)), x_o[:2]),
-    ]
+    x_o, rope = stacks.observed(), stacks.rope_of().train(seed=0, **QUIET)
+    batch = rope.build_posterior(x_o, seed=0, **QUIET)
+    candidates = [stacks.PRIOR, stacks.NPE, stacks.BOX]
+    candidates += [DiscrepancyCandidate(space="tuned"), FinetunedCandidate()]
+    stack = stacks.stacked(rope, candidates=candidates, num_folds=3)
+    cases = [(batch, x_o[:5]), (batch[3], x_o[3:4]), (stack, x_o[:4])]
     for number, (posterior, x) in enumerate(cases):
         save(posterior, tmp_path / f"{number}.pt")
         torch.save((x, *numbers(posterior, x)), tmp_path / f"{number}.expected")
@@ -123,10 +95,7 @@ def test_another_process_loads_the_same_posteriors(tmp_path: Path) -> None:
 def test_every_family_can_be_saved(family: str, tmp_path: Path) -> None:
     npe = problems.npe_posterior(family)
     x = problems.simulate(npe.prior.sample((3,)))
-    for posterior in (npe, mixture_of(npe)):
-        # The mass inside the prior takes draws, which some families search for.
-        loaded = saved_and_loaded(posterior, tmp_path)
-        assert_same(posterior, loaded, x, truncated=False)
+    assert_same_again(npe, x, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -134,20 +103,12 @@ def test_every_family_can_be_saved(family: str, tmp_path: Path) -> None:
 )
 def test_posteriors_of_vector_fields_can_be_saved(method: str, tmp_path: Path) -> None:
     posterior = problems.vector_field_posterior(method)
-    loaded = saved_and_loaded(posterior, tmp_path)
-    assert_same(posterior, loaded, problems.simulate(torch.zeros(1, 2)))
+    assert_same_again(posterior, problems.simulate(torch.zeros(1, 2)), tmp_path)
 
 
-@pytest.mark.parametrize(
-    "prior", [UniformTriangle(torch.tensor(0.5)), PopulationPrior()]
-)
-def test_priors_can_be_saved(prior: Any, tmp_path: Path) -> None:
-    posterior = PriorPosterior(prior)
-    loaded = saved_and_loaded(posterior, tmp_path)
-    assert_same(posterior, loaded, torch.zeros(2, 3))
-
-
-# --- what is refused ---
+def test_priors_can_be_saved(tmp_path: Path) -> None:
+    for prior in (UniformTriangle(torch.tensor(0.5)), PopulationPrior()):
+        assert_same_again(PriorPosterior(prior), torch.zeros(2, 3), tmp_path)
 
 
 class Calls:
@@ -160,17 +121,13 @@ class Calls:
         return self.call
 
 
-def touch(path: Path) -> Calls:
-    return Calls(os.system, f"touch {path}")
-
-
 @pytest.mark.parametrize("write", [pickle.dump, torch.save])
 def test_a_malicious_pickle_is_refused_and_not_executed(
     write: Callable[..., Any], tmp_path: Path
 ) -> None:
     path, target = tmp_path / "posterior.pt", tmp_path / "executed"
     with path.open("wb") as file:
-        write(touch(target), file)
+        write(Calls(os.system, f"touch {target}"), file)
     with pytest.raises(FileFormatError):
         load(path)
     assert not target.exists()
@@ -182,12 +139,10 @@ def test_a_malicious_pickle_is_refused_and_not_executed(
         Calls(eval, "print()"),
         Calls(functools.partial, eval, "print()"),
         Calls(getattr, nn.Linear(1, 1), "forward"),
-        Calls(importlib.import_module, "antigravity"),
         Calls(torch.load, "file"),
         # What is only named may be called by what is known.
         os.system,
         importlib.import_module,
-        torch.distributions.kl_divergence,
         VIPosterior,
         save,
     ],
@@ -200,30 +155,15 @@ def test_calls_in_a_file_are_refused(value: Any, tmp_path: Path) -> None:
         saved_and_loaded(posterior, tmp_path)
 
 
-class OwnNet(nn.Module):
-    """An embedding net that a user has written."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.scale = nn.Parameter(torch.full((1,), 2.0))
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.scale * x
-
-
 def test_classes_of_the_user_have_to_be_trusted(tmp_path: Path) -> None:
     posterior: Any = PriorPosterior(problems.box(2))
-    posterior.net, posterior.function = OwnNet(), problems.simulate
-    with pytest.raises(FileFormatError, match=r"OwnNet.*trusted=\[simulate, OwnNet\]"):
+    posterior.net, posterior.function = problems.Filled(), problems.simulate
+    with pytest.raises(FileFormatError, match=r"trusted=\[Filled, simulate\]"):
         saved_and_loaded(posterior, tmp_path)
-    trusted = [OwnNet, problems.simulate]
+    trusted = [problems.Filled, problems.simulate]
     loaded = saved_and_loaded(posterior, tmp_path, trusted=trusted)
-    assert type(loaded.net) is OwnNet
-    assert loaded.net(torch.ones(1)).item() == 2
+    assert type(loaded.net) is problems.Filled
     assert loaded.function is problems.simulate
-
-
-# --- files ---
 
 
 def test_a_file_is_replaced_only_when_asked_to(tmp_path: Path) -> None:
@@ -256,13 +196,7 @@ def test_damaged_and_foreign_files_are_refused(tmp_path: Path) -> None:
         torch.save(foreign, path)
         with pytest.raises(FileFormatError):
             load(path)
-
-
-def test_files_of_other_versions_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with monkeypatch.context() as patch:
-        patch.setattr("sbi.__version__", "0.1.2")
-        save(PriorPosterior(problems.box(2)), tmp_path / "x.pt")
+    with patch("sbi.__version__", "0.1.2"):
+        save(PriorPosterior(problems.box(2)), path, overwrite=True)
     with pytest.raises(FileFormatError, match=r"0\.1"):
-        load(tmp_path / "x.pt")
+        load(path)

@@ -4,29 +4,25 @@ import math
 import random
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch
-from sbi.utils import BoxUniform
 
 from sbi_rope import RoPE, stack
-from sbi_rope.npe.prior import check_in_support
 from sbi_rope.utils.errors import InvalidInputError
 from sbi_rope.utils.progress import is_shown
 from sbi_rope.utils.seeds import seeded
 from sbi_rope.utils.settings import (
     Count,
     Level,
-    NotNegative,
     Number,
     Positive,
     Range,
     Seed,
-    Settings,
     UnitInterval,
     check,
     one_of,
@@ -36,8 +32,6 @@ from tests import baselines, gaussian
 from tests.refusals import assert_refused
 from tests.stacks import BOX, NPE, PRIOR, QUICK, quick
 
-# --- settings ---
-
 NO_NUMBERS = (None, "1", True, 1j, [1.0], np.ones(2), torch.tensor(1.0), math.nan)
 
 
@@ -46,7 +40,6 @@ NO_NUMBERS = (None, "1", True, 1j, [1.0], np.ones(2), torch.tensor(1.0), math.na
     [
         (Number, (-1e300, np.float32(2)), (*NO_NUMBERS, math.inf)),
         (Positive, (1e-300, 1), (*NO_NUMBERS, 0, -1.0, math.inf)),
-        (NotNegative, (0, 1e300), (*NO_NUMBERS, -1e-300, math.inf)),
         (UnitInterval, (0, 0.5, 1), (*NO_NUMBERS, -0.1, 1.1)),
         (Level, (1e-9, 0.5), (*NO_NUMBERS, 0, 1)),
         (Count, (1, np.int64(3), 10**400), (*NO_NUMBERS, 0, -1, 1.0)),
@@ -54,14 +47,10 @@ NO_NUMBERS = (None, "1", True, 1j, [1.0], np.ones(2), torch.tensor(1.0), math.na
         (Annotated[int, Range(2, 5)], (2, 5), (1, 6, math.inf)),
         (bool, (True, False), (0, 1, None, "True")),
         (Literal["own", "pot"], ("own", np.str_("pot")), ("x", None, ["own"], 1)),
-        (Literal[64, 100], (64, np.int64(100)), (65, "64", True, np.array([64]))),
-        (one_of((True, None)), (True, None), (False, 1, "None")),
+        (one_of((64, 100)), (64, np.int64(100)), (65, "64", True, np.array([64]))),
         (RoPE | None, (None,), (RoPE, 1)),
-        (Positive | Literal["auto"], (2.0, "auto"), (0, "x", None)),
         (Callable[..., Any], (print, int), (None, "print")),
         (Sequence[Positive], ([1, 2.0], (0.5,)), ([], 1.0, "12", [1, -1], [True])),
-        (tuple[Count, ...], ((1, 2),), ([1, 2], (), (0,), (1.5,))),
-        (Any, (None, 1, "a"), ()),
     ],
 )
 def test_values_fit_their_hints(
@@ -72,38 +61,6 @@ def test_values_fit_their_hints(
     for value in bad:
         assert_refused("`setting` to be .*; got", check, "setting", value, kind)
 
-
-def test_a_message_says_what_was_expected_in_words() -> None:
-    for value, kind, words in (
-        (0, Positive, "a number above 0; got 0"),
-        (-1, Seed, "an integer of at least 0 or None; got -1"),
-        (9, Annotated[int, Range(2, 5)], "an integer from 2 to 5; got 9"),
-        ("x", Literal["own", None], r"one of \['own', None\]; got 'x'"),
-        (3, RoPE | None, "a RoPE or None; got 3"),
-    ):
-        message = f"^Expected `a` to be {words}.$"
-        assert_refused(message, check, "a", value, kind, error=InvalidInputError)
-
-
-@dataclass(frozen=True)
-class Kernel(Settings):
-    width: Positive
-    solver: Literal["own", "pot"] = "own"
-
-
-@dataclass(frozen=True)
-class Kernels(Kernel):
-    num_steps: Count | None = None
-
-
-def test_a_class_of_settings_checks_its_fields_and_those_of_its_base() -> None:
-    assert Kernels(0.5, num_steps=3) == Kernels(0.5, "own", 3)
-    assert_refused("`width`.*above 0; got 0", Kernels, 0)
-    assert_refused("`solver`.*got 'x'", Kernels, 0.5, "x")
-    assert_refused("`num_steps`.*got 0", Kernels, 0.5, num_steps=0)
-
-
-# --- tensors ---
 
 X = torch.tensor([[0.1, 0.9], [0.2, 0.8], [0.3, 0.7]])
 
@@ -121,21 +78,16 @@ X = torch.tensor([[0.1, 0.9], [0.2, 0.8], [0.3, 0.7]])
 )
 def test_numbers_in_any_container_become_a_tensor_of_float32(value: Any) -> None:
     found = as_batch("x", value, (2,), rows=3, device=torch.device("cpu"))
-    assert found.dtype == torch.float32
+    assert found.dtype == as_batch("x", X.long()).dtype == torch.float32
     assert not found.requires_grad
     assert torch.equal(found, X)
-
-
-def test_floating_point_tensors_keep_their_dtype_and_other_numbers_do_not() -> None:
     assert as_batch("x", X.double()).dtype == torch.float64
-    for value in (X > 0.5, X.long(), X.numpy() > 0.5, [[1, 2], [3, 4]]):
-        assert as_batch("x", value, (2,)).dtype == torch.float32
 
 
 def test_what_holds_no_real_numbers_is_refused() -> None:
     frame = pd.DataFrame({"speed": [1.0, 2.0], "mouse": ["a", "b"]})
     complex_x = X.to(torch.complex64)
-    for value in (None, "1", ["a"], {}, [[1.0], [1.0, 2.0]], frame, complex_x):
+    for value in (None, ["a"], [[1.0], [1.0, 2.0]], frame, complex_x):
         match = "^Expected `x` to be a tensor, an array, a table or a list of numbers"
         assert_refused(match, as_numbers, "x", value, error=InvalidInputError)
 
@@ -150,49 +102,21 @@ def test_masked_numbers_and_missing_ones_of_a_table_are_nan() -> None:
         assert_refused(match, as_batch, "x", value)
 
 
-def test_parameters_outside_the_prior_are_counted() -> None:
-    prior = BoxUniform(torch.zeros(2), torch.ones(2))
-    theta = torch.cat([X, -X])
-    check_in_support("theta", X, prior)
-    check_in_support("theta", theta, prior, rows=torch.arange(6) < 3)
-    match = r"`theta` inside the support.*3 of 6 rows \(first: \[3, 4, 5\]\)"
-    assert_refused(match, check_in_support, "theta", theta, prior)
-
-
-# --- seeds ---
-
-
 def draws() -> list[float]:
     numbers = float(torch.rand(())), float(np.random.uniform()), random.random()  # noqa: NPY002
     return list(numbers)
 
 
-def test_blocks_can_be_nested_and_give_the_same_numbers_again() -> None:
+def test_blocks_give_the_same_numbers_again_and_restore_the_state_around_them() -> None:
     with seeded(1):
         expected = [draws(), draws()]
     with seeded(1):
         first = draws()
-        with seeded(2):
-            inner = draws()
-        assert [first, draws()] == expected
-    assert inner != first
-
-
-def test_the_state_of_the_caller_is_restored_also_after_an_error() -> None:
-    found = []
-    for is_seeded in (False, True):
-        torch.manual_seed(3)
-        np.random.seed(3)  # noqa: NPY002
-        random.seed(3)
-        if is_seeded:
-            with pytest.raises(ZeroDivisionError), seeded(1):
-                1 / (torch.rand(()).item() * 0)
+        with suppress(ArithmeticError), seeded(2):
+            assert draws() != first
+            raise ArithmeticError
         with seeded(None):
-            found.append(draws())
-    assert found[0] == found[1]
-
-
-# --- progress bars ---
+            assert [first, draws()] == expected
 
 
 def test_bars_are_shown_by_default_where_they_can_be_redrawn(
@@ -209,13 +133,12 @@ def test_bars_are_shown_by_default_where_they_can_be_redrawn(
 def work(*, show: bool) -> None:
     """Call what a user calls."""
     options: Any = {"show_progress_bars": show}
-    theta, x_o = gaussian.labelled(30)
+    x_o = gaussian.labelled(30)[1]
     rope = RoPE(gaussian.posterior(), simulator=gaussian.simulator, finetuner=QUICK)
     rope.append_calibration(*gaussian.labelled(10)).train(**options)
     posterior = rope.build_posterior(x_o, **options)
     posterior.sample_batched((10,), x=x_o, **options)
     posterior[0].sample((10,), **options)
-    posterior.log_prob_batched(theta, x=x_o)
     with quick():
         stack(rope, candidates=(PRIOR, NPE, BOX), num_folds=2, **options)
     method = baselines.make("tuning_only", "linear_gaussian")
@@ -224,19 +147,13 @@ def work(*, show: bool) -> None:
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_no_call_shows_a_bar_in_a_terminal_if_it_is_asked_not_to(
+def test_bars_are_shown_on_stderr_if_and_only_if_they_are_asked_for(
     terminal: pytest.CaptureFixture[str],
 ) -> None:
     work(show=False)
     assert terminal.readouterr() == ("", "")
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_bars_that_are_asked_for_are_shown_without_a_terminal_and_on_stderr(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
     work(show=True)
-    printed = capsys.readouterr()
+    printed = terminal.readouterr()
     assert printed.out == ""
     for bar in ("Fine-tuning", "Sampling", "Epochs trained: 3"):
         assert bar in printed.err
