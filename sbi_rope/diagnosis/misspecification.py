@@ -144,8 +144,8 @@ def distances(real: Tensor, simulated: Tensor, ends: Sequence[Tensor]) -> Tensor
 
     One or two in a thousand simulations exceed the limit if they take the place of
     observations. A tuned g may put observations between simulations, such as between
-    the categories of an entry. The limit allows for the larger of both ``ends``, see
-    :func:`~sbi_rope.diagnosis.prior_shift.prior_shift`.
+    the categories of an entry. The limit is the larger one of the ``ends``, that is, of
+    simulations as tuning would move them and unchanged.
     """
     # A new value exceeds the (k+1)-th largest of n with probability (k + 1) / (n + 1).
     k = int(FLAGGED_SHARE * len(simulated))

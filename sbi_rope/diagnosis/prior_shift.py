@@ -128,9 +128,8 @@ def prior_shift(
     them, and unchanged. A g that was trained little is in between.
 
     A g that was tuned on few pairs misses its targets, and the batch looks shifted too.
-    The same distance is measured between calibration pairs that g has not seen and
-    their targets (``held_out``, with their groups), and the 95 % quantile of its
-    bootstrap is added to the threshold.
+    The same distance is measured between pairs that g has not seen and their targets
+    (``held_out``, with groups), and its 95 % quantile is added to the threshold.
     """
     embedded = ends[-1]
     # At tau = 0 rows do not depend on one another, so that a few are enough.

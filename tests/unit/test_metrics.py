@@ -18,7 +18,6 @@ from sbi_rope.metrics.evaluation import NOMINAL, estimates_and_ranks
 from sbi_rope.npe.sbi import BaseDirectPosterior
 from sbi_rope.utils.errors import InvalidInputError
 from tests import gaussian
-from tests.refusals import assert_refused
 
 NORMAL = Normal(torch.tensor(0.0, dtype=torch.float64), 1.0)
 torch.manual_seed(0)
@@ -30,18 +29,14 @@ GROUP = torch.arange(12).repeat_interleave(4)
 class GaussianPosterior:
     """N(x + bias, scale^2) in every dimension, in sbi's shapes."""
 
-    def __init__(self, bias: float = 0.0, scale: float | Tensor = 1.0) -> None:
-        self.bias, self.scale = bias, torch.as_tensor(scale)
+    def __init__(self, bias: float = 0.0, scale: float = 1.0) -> None:
+        self.bias, self.scale = bias, scale
 
-    def sample_batched(
-        self, sample_shape: torch.Size, x: Tensor, show_progress_bars: bool = True
-    ) -> Tensor:
-        noise = torch.randn(*sample_shape, *x.shape, dtype=x.dtype)
-        return x + self.bias + self.scale * noise
+    def sample_batched(self, sample_shape: Any, x: Tensor, **options: Any) -> Tensor:
+        return Normal(x + self.bias, self.scale).sample(sample_shape)
 
     def log_prob_batched(self, theta: Tensor, x: Tensor) -> Tensor:
-        theta = theta if theta.ndim > 2 else theta.unsqueeze(0)
-        return Normal(x + self.bias, self.scale).log_prob(theta).sum(dim=-1)
+        return Normal(x + self.bias, self.scale).log_prob(theta[None]).sum(dim=-1)
 
 
 def gaussian_pairs(n: int, d: int = 1) -> tuple[Tensor, Tensor]:
@@ -145,11 +140,7 @@ def test_calibrated_ranks_of_ten_seldom_have_an_interval_without_zero(
 
 
 def expected_acauc(bias: float, scale: float, *, num_ranks: int) -> float:
-    """Integrate the mean level over the distribution of the truth, N(0, 1).
-
-    For many samples the rank is normal around the distribution function. The level is
-    then folded normal, whose mean is at least about 1 / sqrt(M).
-    """
+    """Integrate the mean level, folded normal for many samples, over the truth."""
     z = torch.linspace(-9, 9, 20001, dtype=torch.float64)
     rank = NORMAL.cdf((z - bias) / scale)
     level = (2 * rank - 1).abs()
@@ -166,20 +157,15 @@ def test_acauc_of_gaussian_posteriors_has_its_exact_and_its_published_value() ->
     for bias, scale, published in (
         (0.0, 1.0, 0.0015),  # calibrated
         (0.0, 0.3, 0.3127),  # over-confident
-        (0.0, 0.01, 0.492),
         (0.0, 3.0, -0.298),  # under-confident
-        (0.0, 100.0, -0.474),
         (2.0, 1.0, 0.356),  # too high
-        (-2.0, 1.0, 0.354),  # too low
-        (50.0, 0.1, 0.499),
     ):
         posterior = GaussianPosterior(bias, scale)
         found = metrics.evaluate(posterior, theta, x, num_samples=1250).acauc
         exact = expected_acauc(bias, scale, num_ranks=1000)
-        case = f"bias {bias} and scale {scale}: {found}"
         # 0.001: finitely many samples; 0.002: the error of the published value.
-        assert abs(found.mean - exact) < 2 * half(found) + 0.001, case
-        assert abs(found.mean - published) < 2 * half(found) + 0.002, case
+        assert abs(found.mean - exact) < 2 * half(found) + 0.001
+        assert abs(found.mean - published) < 2 * half(found) + 0.002
 
 
 def test_coverage_of_gaussian_posteriors_follows_its_formula() -> None:
@@ -209,12 +195,10 @@ def test_lpp_of_a_gaussian_matches_its_closed_form_in_any_unit() -> None:
     assert found.lpp_z.mean == pytest.approx(float(scaled.mean()), abs=1e-4)
 
 
-def estimated(n: int = 300, seed: int = 0) -> tuple[Tensor, Tensor]:
+def estimated() -> tuple[Tensor, Tensor]:
     """Parameters of a linear-Gaussian problem, and their exact posterior means."""
-    generator = torch.Generator().manual_seed(seed)
-    theta = torch.randn(n, 1, generator=generator)
-    noise = gaussian.NOISE_STD * torch.randn(n, 1, generator=generator)
-    return theta, gaussian.GAIN * (theta + noise)
+    theta, noise = torch.randn(2, 300, 1, generator=torch.Generator().manual_seed(0))
+    return theta, gaussian.GAIN * (theta + gaussian.NOISE_STD * noise)
 
 
 def ranks_in(theta: Tensor, mean: Tensor, std: Tensor | float) -> Tensor:
@@ -224,28 +208,28 @@ def ranks_in(theta: Tensor, mean: Tensor, std: Tensor | float) -> Tensor:
 
 @pytest.mark.medium
 def test_p_values_of_calibrated_posteriors_are_uniform() -> None:
-    """This holds for estimates of any distribution, and with few observations."""
     generator = torch.Generator().manual_seed(0)
-    found = scored(
-        torch.rand(15, 100, generator=generator),
-        torch.randn(15, 100, generator=generator).exp(),
-    )
+    ranks = torch.rand(15, 100, generator=generator)
+    found = scored(ranks, torch.randn(15, 100, generator=generator).exp())
     assert kstest(found.dependence, "uniform").pvalue > 0.01
 
 
-@pytest.mark.parametrize("error", ["slope", "curve", "width in the tail", "width"])
-def test_errors_that_depend_on_the_estimate_are_found(error: str) -> None:
+@pytest.mark.parametrize(
+    ("mean_of", "std_of"),
+    [
+        (lambda mean: 1.3 * mean, torch.ones_like),
+        (lambda mean: mean + 0.2 * (mean.square() - 0.8), torch.ones_like),
+        (lambda mean: mean, lambda mean: (0.5 * mean).exp()),
+        (lambda mean: mean, lambda mean: 1.0 - 0.5 * (mean.abs() > mean.std())),
+    ],
+    ids=["slope", "curve", "width", "width in the tail"],
+)
+def test_errors_that_depend_on_the_estimate_are_found(
+    mean_of: Any, std_of: Any
+) -> None:
     theta, mean = estimated()
-    std: Tensor | float = gaussian.POSTERIOR_STD
-    if error == "slope":
-        mean = 1.3 * mean
-    elif error == "curve":
-        mean = mean + 0.2 * (mean.square() - mean.square().mean())
-    elif error == "width in the tail":
-        std = torch.where(mean.abs() > mean.std(), 0.5 * std, std)
-    else:
-        std = std * (0.5 * mean).exp()
-    assert scored(ranks_in(theta, mean, std), mean).dependence[0] < 0.05
+    ranks = ranks_in(theta, mean_of(mean), gaussian.POSTERIOR_STD * std_of(mean))
+    assert scored(ranks, mean_of(mean)).dependence[0] < 0.05
 
 
 def test_coverage_is_said_for_each_third_of_the_estimates() -> None:
@@ -263,39 +247,33 @@ def test_coverage_is_said_for_each_third_of_the_estimates() -> None:
     assert math.isnan(found.dependence[1])
 
 
-def test_one_known_pair_of_each_group_is_tested() -> None:
+def test_one_pair_of_each_group_is_tested() -> None:
     theta, mean = estimated()
-    ranks = ranks_in(theta, 1.02 * mean, gaussian.POSTERIOR_STD)
-    group = torch.arange(300).repeat(20)
-    twins = scored(ranks.repeat(20, 1), mean.repeat(20, 1), group=group)
+    ranks = ranks_in(theta, 1.02 * mean, gaussian.POSTERIOR_STD).repeat(20, 1)
+    mean, group = mean.repeat(20, 1), torch.arange(300).repeat(20)
     # All rows would make an error significant that so few do not show.
-    assert scored(twins.ranks, twins.estimates).dependence[0] < 0.01
-    assert twins.dependence[0] > 0.01
-    gaps = torch.cat([ranks, torch.full_like(ranks, torch.nan)])
-    found = scored(gaps, torch.cat([mean, mean])).dependence
-    assert found == scored(ranks, mean).dependence
+    assert scored(ranks, mean).dependence[0] < 0.01
+    assert scored(ranks, mean, group=group).dependence[0] > 0.01
 
 
 def test_an_evaluation_says_what_was_found() -> None:
     torch.manual_seed(3)
-    theta = gaussian.prior().sample((300,))
+    posterior, theta = gaussian.posterior(), gaussian.prior().sample((300,))
     x = gaussian.simulator(theta)
-    right = metrics.evaluate(gaussian.posterior(), theta, x, num_samples=200, seed=0)
-    text = str(right)
-    assert "Calibrated as far as 300 observations can tell" in text
-    assert "No sign that coverage depends on the estimate" in text
-    assert f"{right.lpp:.2f}" in text
-    assert f"{right.lpp_z:.2f}" in text
-    assert "density zero" not in text
+    right = metrics.evaluate(posterior, theta, x, num_samples=200, seed=0)
+    for text in (
+        "Calibrated as far as 300 observations can tell",
+        "No sign that coverage depends on the estimate",
+        f"{right.lpp:.2f}",
+        f"{right.lpp_z:.2f}",
+    ):
+        assert text in str(right)
     # With too large a gain, the posterior overestimates what is large.
-    posterior = gaussian.posterior()
     posterior.parameter_names = ("mass", "length")  # as stacks have
     wrong = metrics.evaluate(posterior, theta, 1.4 * x, num_samples=200, seed=0)
-    text = str(wrong)
-    assert "The posterior is over-confident: ACAUC +" in text
-    assert "mass alone is over-confident" in text
-    assert "The coverage of length depends on its estimate (p = 0.001)" in text
-    assert f"90% intervals {wrong.coverage[89].mean():.0%}" in text
+    assert "The posterior is over-confident: ACAUC +" in str(wrong)
+    assert "mass alone is over-confident" in str(wrong)
+    assert f"90% intervals {wrong.coverage[89].mean():.0%}" in str(wrong)
     assert "Too few known parameters" in str(scored(RANKS[:4]))
     narrow = (1 + torch.linspace(0, 1, 60).square()) / 2
     assert "The posterior is too wide: ACAUC -" in str(scored(narrow[:, None]))
@@ -356,26 +334,11 @@ def test_a_posterior_with_bounded_rejection_is_called_as_it_is() -> None:
     assert found.lpp.mean == 0.0
 
 
-def test_units_that_are_no_unit_are_refused() -> None:
-    theta, x = gaussian_pairs(12, d=2)
-    wrong = {
-        "`theta_std` of shape": torch.ones(3),
-        "`theta_std` to be a number above 0": torch.tensor([1.0, 0.0]),
-    }
-    for match, std in wrong.items():
-        posterior = GaussianPosterior()
-        assert_refused(match, metrics.evaluate, posterior, theta, x, theta_std=std)
-
-
-SEVENTH = torch.tensor([7])
-
-
 @pytest.mark.parametrize(
     ("method", "spoil", "match"),
     [
-        # The seventh row of both chunks.
-        ("log_prob_batched", lambda p: p.index_fill(1, SEVENTH, math.nan), r"\[7, 107"),
-        ("log_prob_batched", lambda p: p.index_fill(1, SEVENTH, math.inf), r"\[7, 107"),
+        ("log_prob_batched", lambda p: p * math.nan, "NaN or .Inf in 120 of 120 rows"),
+        ("log_prob_batched", lambda p: p + math.inf, "NaN or .Inf in 120 of 120 rows"),
         ("sample_batched", lambda samples: samples * math.nan, "NaN"),
         ("sample_batched", lambda samples: samples.repeat(1, 1, 2), r"\(20, 100, 2\)"),
     ],
@@ -383,8 +346,8 @@ SEVENTH = torch.tensor([7])
 def test_a_posterior_that_returns_nan_or_a_wrong_shape_is_refused(
     method: str, spoil: Any, match: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    right = getattr(GaussianPosterior, method)
-    wrong = lambda *given, **options: spoil(right(*given, **options))  # noqa: E731
-    monkeypatch.setattr(GaussianPosterior, method, wrong)
+    posterior = GaussianPosterior()
+    right = getattr(posterior, method)
+    monkeypatch.setattr(posterior, method, lambda *a, **b: spoil(right(*a, **b)))
     with pytest.raises(InvalidInputError, match=match):
-        metrics.evaluate(GaussianPosterior(), *gaussian_pairs(120), num_samples=20)
+        metrics.evaluate(posterior, *gaussian_pairs(120), num_samples=20)
