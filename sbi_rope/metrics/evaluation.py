@@ -152,8 +152,8 @@ class Evaluation:
     def acauc_of_parameters(self) -> tuple[Estimate, ...]:
         """The ACAUC of each parameter alone.
 
-        The intervals of d calibrated parameters all hold 0 in at least 95 % of the
-        cases (Bonferroni).
+        The intervals of d calibrated parameters all hold 0 in about 95 % of the cases
+        (Bonferroni).
         """
         columns = self.levels.unbind(dim=1)
         return tuple(self._acauc(one, 1 - 0.05 / len(columns)) for one in columns)
