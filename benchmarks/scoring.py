@@ -212,7 +212,9 @@ def _result(
     row = {
         **asdict(cell),
         "status": "finished",
-        **evaluation.as_row(),
+        "lpp": evaluation.lpp.mean,
+        "lpp_z": evaluation.lpp_z.mean,
+        "acauc": evaluation.acauc.mean,
         "lpp_median": float(log_prob.quantile(0.5, interpolation="nearest")),
         "neg_inf_fraction": float(log_prob.isneginf().double().mean()),
         "lpp_standard_error": float(log_prob.std()) / root,

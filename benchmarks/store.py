@@ -21,7 +21,7 @@ COLUMNS = [
     *("suite", *CELL_COLUMNS, "status"),
     *("lpp", "lpp_z", "lpp_median", "lpp_standard_error", "neg_inf_fraction"),
     *("acauc", "acauc_standard_error", "acauc_per_parameter"),
-    *("expected_coverage_error", "converged", "n_test", "stand_in"),
+    *("converged", "n_test", "stand_in"),
     *("held_out", "held_out_error", "best_candidate", "best_basic"),
     *("seconds_npe", "seconds_train", "seconds_couple", "seconds_test"),
     *("num_simulations", "device", "versions", "git_commit", "finished_at", "error"),

@@ -166,7 +166,7 @@ def gammas(rope: RoPE, theta: Tensor, x_o: Tensor) -> "Figure":
 def other_prior(rope: RoPE, theta_o: Tensor, x_o: Tensor) -> "Figure":
     """Draw the parameters that a batch with much red implies."""
     bright = x_o[theta_o[:, 0] > 45]
-    diagnosis = diagnose(rope, bright, parameter_names=ALL_NAMES, seed=0, **QUIET)
+    diagnosis = diagnose(rope, bright, seed=0, **QUIET)
     return arranged(plots.implied_parameters(diagnosis), columns=2, size=(7.0, 5.0))
 
 
@@ -222,7 +222,8 @@ def main() -> None:
     theta_cal, x_cal = theta[:NUM_LABELLED], x[:NUM_LABELLED]
     theta_o, x_o = theta[NUM_LABELLED:], x[NUM_LABELLED:]
     npe, simulator = trained_npe()
-    rope = RoPE(npe, simulator=simulator, coupler=SinkhornCoupler(gamma=0.1))
+    coupler = SinkhornCoupler(gamma=0.1)
+    rope = RoPE(npe, simulator=simulator, coupler=coupler, parameter_names=ALL_NAMES)
     rope.append_calibration(theta_cal, x_cal).train(seed=0, **QUIET)
 
     save(hemodynamics(), "hemodynamics")

@@ -41,7 +41,6 @@ COLUMNS = (
     "lpp",
     "lpp_z",
     "acauc",
-    "expected_coverage_error",
     "seconds",
 )
 # Draws per observation behind the calibration scores.
@@ -121,7 +120,9 @@ class Study:
                 method=method,
                 n_calibration=n,
                 seconds=round(time.perf_counter() - start, 1),
-                **evaluation.as_row(),
+                lpp=evaluation.lpp.mean,
+                lpp_z=evaluation.lpp_z.mean,
+                acauc=evaluation.acauc.mean,
             )
 
         print(f"Seed {seed}: {task.name}, {self.n_test} test observations", flush=True)
@@ -141,7 +142,13 @@ class Study:
         for n in self.n_calibration:
             start = time.perf_counter()
             theta_cal, x_cal = task.get_calibration_set(n, seed=seed)
-            rope = RoPE(npe, coupler=self.coupler, finetuner=self.finetuner, **source)
+            rope = RoPE(
+                npe,
+                coupler=self.coupler,
+                finetuner=self.finetuner,
+                parameter_names=task.parameter_names,
+                **source,
+            )
             rope.append_calibration(theta_cal, x_cal)
             rope.train(seed=seed, show_progress_bars=False)
             score("tuning-only", rope.tuned_posterior(), start, n)
@@ -171,7 +178,6 @@ class Study:
                 diagnosis = diagnose(
                     rope,
                     x_o,
-                    parameter_names=task.parameter_names,
                     seed=seed,
                     show_progress_bars=False,
                 )
@@ -285,10 +291,10 @@ class ResultsFile:
 
 EXPLANATION = """
 LPP: mean log-probability of the true parameters, in standard deviations of the prior
-(higher is better). ACAUC: 0 is calibrated, above 0 is over-confident. ECE: expected
-coverage error. NPE and tuning-only are scored without sbi's leakage correction. SBI is
-NPE on simulations that it has not seen. RoPE has one setting, fixed beforehand; stack
-weighs its rivals by hold-out pairs.
+(higher is better). ACAUC: 0 is calibrated, above 0 is over-confident. NPE and
+tuning-only are scored without sbi's leakage correction. SBI is NPE on simulations that
+it has not seen. RoPE has one setting, fixed beforehand; stack weighs its rivals by
+hold-out pairs.
 With several seeds: mean, and standard deviation of the LPP over seeds (+-).
 """
 
@@ -301,10 +307,10 @@ def print_table(rows: list[dict[str, Any]], *, explain: bool = True) -> None:
     frame = pd.DataFrame(rows)
     frame["method"] = pd.Categorical(frame["method"], order)
     groups = frame.groupby(["method", "n_calibration"], observed=True)
-    columns = ["lpp_z", "acauc", "expected_coverage_error"]
+    columns = ["lpp_z", "acauc"]
     table = groups[columns].mean()
     table.insert(1, "+-", groups["lpp_z"].std())
-    table.columns = ["LPP", "+-", "ACAUC", "ECE"]
+    table.columns = ["LPP", "+-", "ACAUC"]
     table = table.rename_axis(["method", "pairs"]).reset_index()
     table["pairs"] = table["pairs"].replace({0: "-"})
     print(
@@ -312,7 +318,7 @@ def print_table(rows: list[dict[str, Any]], *, explain: bool = True) -> None:
             index=False,
             na_rep="-",
             float_format="{:.2f}".format,
-            formatters=dict.fromkeys(("ACAUC", "ECE"), "{:.3f}".format),
+            formatters={"ACAUC": "{:.3f}".format},
         )
     )
 

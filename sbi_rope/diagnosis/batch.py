@@ -13,20 +13,19 @@ from sbi_rope.diagnosis.misspecification import (
     after_tuning,
     before_tuning,
     distances,
-    effective_sizes,
     far_entries,
     mmd_test,
     unlike_pairs,
     unmatched,
 )
-from sbi_rope.diagnosis.prior_shift import Simulations, cross_fit, prior_shift, shifts
+from sbi_rope.diagnosis.prior_shift import averaged, cross_fit, prior_shift, shifts
 from sbi_rope.diagnosis.report import Diagnosis, Finding
 from sbi_rope.metrics.statistics import TwoSampleTest, compare_with_pairs
 from sbi_rope.rope.rope import RoPE
 from sbi_rope.utils.errors import InvalidInputError
 from sbi_rope.utils.progress import is_shown
 from sbi_rope.utils.seeds import seeded
-from sbi_rope.utils.settings import Range, check, default_names, names_of
+from sbi_rope.utils.settings import Range, check, default_names
 
 # With fewer simulations the thresholds cannot be estimated.
 FEWEST_SIMULATIONS = 100
@@ -42,7 +41,6 @@ def diagnose(
     num_simulations: int | None = None,
     num_folds: int | None = 5,
     posterior: MixturePosterior | None = None,
-    parameter_names: Sequence[str] | None = None,
     seed: int | None = None,
     show_progress_bars: bool | None = None,
 ) -> Diagnosis:
@@ -56,11 +54,9 @@ def diagnose(
     4. Does :math:`h(x_o)` differ from :math:`h(x_s)`? This is an MMD test.
     5. Does :math:`g(x_o)` still differ from simulations, after tuning?
     6. Which observations have no simulation near them?
-    7. How many simulations are behind each posterior?
 
-    The last three are about RoPE only. Without calibration pairs g is h, and 1 and 5
-    are left out. Each of 1, 3, 4, 5 and 6 raises an alarm by chance in one batch of
-    a hundred. The thresholds of 7 are rules of thumb about gamma.
+    The last two are about RoPE only. Without calibration pairs g is h, and 1 and 5 are
+    left out. Each of 1 and 3 to 6 raises an alarm by chance in one batch of a hundred.
 
     Args:
         rope: A RoPE, which is not changed. If calibration pairs were appended but not
@@ -71,11 +67,9 @@ def diagnose(
         num_folds: The number of folds of the pairs for the allowance for errors of g in
             3, each of which takes as long as ``rope.train``. None does without it.
         posterior: The posterior that you use, made with the same pairs. For a stack 5
-            to 7 are left out; 6 takes the place of 2 if x is not standardised. A shift
+            and 6 are left out; 6 takes the place of 2 if x is not standardised. A shift
             of 3 is no alarm if the stack has learned it from the pairs, and 1 shows no
             sign of a difference.
-        parameter_names: One name for each parameter. If None, those of ``rope``, or
-            "theta_1" and so on.
         seed: Seed of everything random; None uses the states of torch, NumPy and
             Python. The simulations are those of ``rope.build_posterior`` with the same
             seed and number.
@@ -108,37 +102,34 @@ def diagnose(
                 f"Expected at least {FEWEST_SIMULATIONS} simulations, to estimate the "
                 f"thresholds; got {n_s}."
             )
-        names = rope.npe.parameter_names or default_names(dim)
-        if parameter_names is not None:
-            names = names_of(parameter_names, dim)
-        npe, real, simulated = rope.npe, _moved(real), _moved(simulated)
+        npe, names = rope.npe, rope.npe.parameter_names or default_names(dim)
+        real, theta, simulated = (_moved(some) for some in (real, theta, simulated))
         embedded = npe.embed("x_o", x_o, npe.h)
-        simulations = Simulations(_moved(theta), simulated, tuned)
         before = mmd_test(_moved(embedded), simulated, simulated)
-        like_pairs = after = held_out = None
+        ends, like_pairs, after, held_out = [simulated], None, None, None
         if tuned:
             of_pairs, groups = npe.embed("x", pairs.x, npe.h), pairs.group.cpu()
             like_pairs = compare_with_pairs(of_pairs, groups, embedded, npe.density())
-            after = mmd_test(real, simulated, simulations.averaged)
-        distance = distances(real, simulated, simulations.averaged)
+            ends = [averaged(simulated, theta, simulated), simulated]
+            after = mmd_test(real, simulated, ends[0])
+        distance = distances(real, simulated, ends)
         if num_folds is not None and pairs.num_groups > 1:
-            held_out = cross_fit(rope, num_folds, show=is_shown(show_progress_bars))
-        shift = prior_shift(real, simulations, held_out)
+            show = is_shown(show_progress_bars)
+            points, targets = cross_fit(rope, num_folds, show=show)
+            held_out = points, averaged(targets, theta, simulated), pairs.group.cpu()
+        shift = prior_shift(real, theta, ends, held_out)
+        learned = _learned(posterior, like_pairs, names)
         far, near = far_entries(npe.h, x_o), unmatched(distance, n_s)
         findings = [
             unlike_pairs(like_pairs, names),
             far,
-            *shifts(shift, simulations, names, _learned(posterior, like_pairs, names)),
+            *shifts(shift, theta, names, learned, tuned=tuned),
             before_tuning(before, tuned=tuned),
         ]
-        if not hasattr(posterior, "report"):
-            coupling = rope.coupler.couple(real, simulated)
-            findings += [
-                after_tuning(after),
-                near,
-                effective_sizes(coupling, n_s),
-            ]
-        elif far.value is None:  # a stack, of which a broken observation must be found
+        is_stack = hasattr(posterior, "report")
+        if after is not None and not is_stack:
+            findings.append(after_tuning(after))
+        if far.value is None or not is_stack:  # a broken one must be found in a stack
             findings.append(near)
         # So many that a histogram is smooth.
         prior = _moved(npe.prior.sample(torch.Size((20_000,))))
@@ -148,7 +139,7 @@ def diagnose(
     return Diagnosis(
         findings=tuple(sorted(findings, key=lambda one: not one.alarming)),
         distance=distance,
-        theta=simulations.theta,
+        theta=theta,
         implied=shift.implied,
         unshifted=shift.unshifted,
         prior=prior,

@@ -6,7 +6,6 @@ import torch
 from scipy.stats import binom
 from torch import Tensor, nn
 
-from sbi_rope.coupling import Coupling
 from sbi_rope.diagnosis.report import Finding
 from sbi_rope.metrics.statistics import LEVEL, TwoSampleTest
 from sbi_rope.npe.standardisation import FAR, deviations
@@ -21,11 +20,6 @@ FLAGGED_SHARE = 0.001
 # Among many observations some are flagged by chance, but hardly one is this many times
 # as far away as the limit.
 FAR_AWAY = 2.0
-# With ten simulations the centre of a posterior is off by a third of their spread,
-# which should be an exception.
-FEW, MANY_WITH_FEW = 10.0, 0.05
-# A posterior over half of all simulations is almost the prior.
-INDISTINCT = 0.5
 
 
 def mmd_test(batch: Tensor, simulated: Tensor, null: Tensor) -> tuple[float, float]:
@@ -72,22 +66,35 @@ def before_tuning(test: tuple[float, float], *, tuned: bool) -> Finding:
             "Either the simulator is wrong or the batch has other parameters than the "
             "prior. Append calibration pairs, which repair the first."
         )
-    text = f"{_unlike('NPE', *test)} {advice}"
-    name = "misspecification before tuning"
-    return _by_p_value(name, test[1], text, is_alarm=not tuned)
+    return _unlike("before", "NPE", test, advice, is_alarm=not tuned)
 
 
-def after_tuning(test: tuple[float, float] | None) -> Finding:
+def after_tuning(test: tuple[float, float]) -> Finding:
     """Say whether tuning has moved the batch among the simulations."""
-    name = "misspecification after tuning"
-    if test is None:
-        return Finding(name, "Not tested, because there are no calibration pairs.")
     advice = (
         "Append more calibration pairs like the batch, or lower tau if the batch is "
         "narrower than the prior or shifted."
     )
-    text = _unlike("RoPE's tuned embedding net", *test)
-    return _by_p_value(name, test[1], f"{text} {advice}")
+    return _unlike("after", "RoPE's tuned embedding net", test, advice)
+
+
+def _unlike(
+    when: str,
+    net: str,
+    test: tuple[float, float],
+    advice: str,
+    *,
+    is_alarm: bool = True,
+) -> Finding:
+    ratio, p_value = test
+    text = (
+        f"{net} sees the batch as unlike simulations: its squared MMD is "
+        f"{ratio:.{0 if ratio >= 10 else 1}f} times that of a batch of simulations "
+        f"(p = {p_value:.2g}). {advice}"
+    )
+    return _by_p_value(
+        f"misspecification {when} tuning", p_value, text, is_alarm=is_alarm
+    )
 
 
 def unlike_pairs(test: TwoSampleTest | None, names: Sequence[str]) -> Finding:
@@ -97,22 +104,13 @@ def unlike_pairs(test: TwoSampleTest | None, names: Sequence[str]) -> Finding:
         few = "five observations and five pairs with different labels (or groups)"
         return Finding(name, f"Not tested, because this needs {few}.")
     found = ", ".join(test.parameters(names))
-    where = f", and its parameters differ in {found}" if found else ""
+    where = f": its parameters differ in {found}" if found else ""
     text = (
-        f"NPE sees the batch as unlike the pairs (p = {test.p_value:.2g}): its "
-        f"observations are {test.spread:.2f} times as far apart{where}. Label some "
-        "observations like those of the batch. Weights, scores, calibration and "
-        "guarantees that were found on the pairs need not hold here."
+        f"NPE sees the batch as unlike the pairs (p = {test.p_value:.2g}){where}. "
+        "Label some observations like those of the batch. Weights, scores, calibration "
+        "and guarantees that were found on the pairs need not hold here."
     )
     return _by_p_value(name, test.p_value, text)
-
-
-def _unlike(net: str, ratio: float, p_value: float) -> str:
-    return (
-        f"{net} sees the batch as unlike simulations: its squared MMD is "
-        f"{ratio:.{0 if ratio >= 10 else 1}f} times that of a batch of simulations "
-        f"(p = {p_value:.2g})."
-    )
 
 
 def _by_p_value(
@@ -141,19 +139,19 @@ def far_entries(embedding_net: nn.Module, x_o: Tensor) -> Finding:
     return Finding(name, sentence, value > FAR, value, FAR)
 
 
-def distances(real: Tensor, simulated: Tensor, averaged: Tensor) -> Tensor:
+def distances(real: Tensor, simulated: Tensor, ends: Sequence[Tensor]) -> Tensor:
     """Return how far ``real`` is from the nearest simulation, where 1 is the limit.
 
     One or two in a thousand simulations exceed the limit if they take the place of
-    observations. A tuned g averages over the simulator's noise, and may put
-    observations between simulations, such as between the categories of an entry. The
-    limit allows for that, by the ``averaged`` simulations.
+    observations. A tuned g may put observations between simulations, such as between
+    the categories of an entry. The limit is the larger one of the ``ends``, that is, of
+    simulations as tuning would move them and unchanged.
     """
     # A new value exceeds the (k+1)-th largest of n with probability (k + 1) / (n + 1).
     k = int(FLAGGED_SHARE * len(simulated))
     limit = max(
-        float(_nearest(ends, simulated, others=True).sort().values[-1 - k])
-        for ends in (simulated, averaged)
+        float(_nearest(end, simulated, others=True).sort().values[-1 - k])
+        for end in ends
     )
     return _nearest(real, simulated) / max(limit, torch.finfo(torch.float64).tiny)
 
@@ -190,25 +188,4 @@ def unmatched(distance: Tensor, num_simulations: int) -> Finding:
         shown = ", ".join(map(str, flags[:10])) + (", ..." if flags[10:] else "")
         sentence += f" Look at {shown} before you trust their posteriors."
     name = "observations no simulation matches"
-    return Finding(name, sentence, alarming, value, threshold)
-
-
-def effective_sizes(coupling: Coupling, num_simulations: int) -> Finding:
-    """Say whether posteriors of RoPE use very few simulations, or almost all."""
-    sizes = coupling.effective_sample_size.cpu().double()
-    share, median = float((sizes < FEW).double().mean()), float(sizes.median())
-    sentence = (
-        f"A typical posterior of RoPE uses {median:.3g} of {num_simulations} "
-        f"simulations, and {share:.0%} use fewer than {FEW:.0f}."
-    )
-    value, threshold = share, MANY_WITH_FEW
-    if share > MANY_WITH_FEW:
-        sentence += " Raise `num_simulations` or gamma."
-    elif median > INDISTINCT * num_simulations:
-        value, threshold = median / num_simulations, INDISTINCT
-        sentence += (
-            " This is almost the prior. Lower gamma, or, for a single observation, use "
-            "`stack(rope)`, which needs no batch."
-        )
-    name, alarming = "simulations behind each posterior", value > threshold
     return Finding(name, sentence, alarming, value, threshold)

@@ -1,8 +1,7 @@
 """Compare the parameters that the batch implies with the prior."""
 
 from collections.abc import Container, Sequence
-from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -31,76 +30,47 @@ MAX_FOR_NOISE = 2000
 CHUNK = 500  # points whose weights are computed at a time
 
 
-@dataclass(frozen=True, eq=False)
-class Simulations:
-    r"""Simulations from the prior, in float64 on the CPU.
+def noise_of(theta: Tensor, embedded: Tensor) -> Tensor:
+    r"""Return the covariance :math:`W` of :math:`h(x_s)` given theta, ``(l, l)``.
 
-    Attributes:
-        theta: Their parameters, ``(n_s, d)``.
-        embedded: :math:`h(x_s)`, ``(n_s, l)``.
-        tuned: Whether g was tuned, so that it may average over the simulator's noise.
+    It is estimated from differences between simulations with neighbouring parameters,
+    without a quadratic trend. With many parameters and few simulations, neighbours are
+    far apart and the estimate is too large.
     """
-
-    theta: Tensor
-    embedded: Tensor
-    tuned: bool
-
-    @cached_property
-    def noise(self) -> Tensor:
-        r"""Covariance :math:`W` of :math:`h(x_s)` given theta, ``(l, l)``.
-
-        It is estimated from differences between simulations with neighbouring
-        parameters, without a quadratic trend. With many parameters and few simulations,
-        neighbours are far apart and the estimate is too large.
-        """
-        theta, embedded = self.theta[:MAX_FOR_NOISE], self.embedded[:MAX_FOR_NOISE]
-        standard = (theta - theta.mean(dim=0)) / divisors(theta.std(dim=0))
-        ones = torch.ones_like(standard[:, :1])
-        features = torch.cat([ones, standard, standard.square()], dim=1)
-        residual = embedded - features @ (torch.linalg.pinv(features) @ embedded)
-        distance = torch.cdist(standard, standard).fill_diagonal_(torch.inf)
-        difference = residual - residual[distance.argmin(dim=1)]
-        return difference.T @ difference / (2 * len(difference))
-
-    @cached_property
-    def averaged(self) -> Tensor:
-        """Embeddings of the simulations as a tuned g would have them, ``(n_s, l)``."""
-        return self.average(self.embedded)
-
-    def average(self, points: Tensor) -> Tensor:
-        r"""Move embeddings ``(n, l)`` as tuning does if nothing is wrong.
-
-        Tuning moves :math:`g(x)` towards :math:`E[h \mid \theta]`. It can reach at best
-        the mean of this given x, to first order :math:`\mu + (I - W V^{-1})(h - \mu)`,
-        with V the covariance of h. Without tuning, h is not changed.
-        """
-        if not self.tuned:
-            return points
-        mean = self.embedded.mean(dim=0)
-        centred = self.embedded - mean
-        values, vectors = torch.linalg.eigh(centred.T @ centred / len(centred))
-        kept = values > 1e-10 * values.max()
-        root = vectors[:, kept] * values[kept].sqrt()
-        inverse = vectors[:, kept] / values[kept].sqrt()
-        share, basis = torch.linalg.eigh(inverse.T @ self.noise @ inverse)
-        left = (1.0 - share).clamp(0.0, 1.0)
-        return mean + (points - mean) @ (inverse @ (basis * left) @ basis.T @ root.T)
+    theta, embedded = theta[:MAX_FOR_NOISE], embedded[:MAX_FOR_NOISE]
+    standard = (theta - theta.mean(dim=0)) / divisors(theta.std(dim=0))
+    ones = torch.ones_like(standard[:, :1])
+    features = torch.cat([ones, standard, standard.square()], dim=1)
+    residual = embedded - features @ (torch.linalg.pinv(features) @ embedded)
+    distance = torch.cdist(standard, standard).fill_diagonal_(torch.inf)
+    difference = residual - residual[distance.argmin(dim=1)]
+    return difference.T @ difference / (2 * len(difference))
 
 
-class HeldOut(NamedTuple):
-    r"""Pairs embedded by nets g that were not trained on them, and their targets.
+def averaged(points: Tensor, theta: Tensor, embedded: Tensor) -> Tensor:
+    r"""Move embeddings ``(n, l)`` as tuning does if nothing is wrong.
 
-    ``embedded`` is :math:`g(x)`, and ``targets`` :math:`E[h(S(\theta))]`, ``(n_c, l)``.
-    Pairs of one ``group``, ``(n_c,)``, are not independent: their errors are alike.
+    Tuning moves :math:`g(x)` towards :math:`E[h \mid \theta]`. It can reach at best the
+    mean of this given x, to first order :math:`\mu + (I - W V^{-1})(h - \mu)`, with V
+    the covariance of h.
     """
+    mean = embedded.mean(dim=0)
+    centred = embedded - mean
+    values, vectors = torch.linalg.eigh(centred.T @ centred / len(centred))
+    kept = values > 1e-10 * values.max()
+    root = vectors[:, kept] * values[kept].sqrt()
+    inverse = vectors[:, kept] / values[kept].sqrt()
+    noise = inverse.T @ noise_of(theta, embedded) @ inverse
+    share, basis = torch.linalg.eigh(noise)
+    left = (1.0 - share).clamp(0.0, 1.0)
+    return mean + (points - mean) @ (inverse @ (basis * left) @ basis.T @ root.T)
 
-    embedded: Tensor
-    targets: Tensor
-    group: Tensor
 
+def cross_fit(rope: RoPE, num_folds: int, *, show: bool) -> tuple[Tensor, Tensor]:
+    r"""Return g(x) of each pair, of a net g trained on the other folds, and its target.
 
-def cross_fit(rope: RoPE, num_folds: int, *, show: bool) -> HeldOut:
-    """Embed each calibration pair by a g that was trained on the other folds."""
+    The target is :math:`E[h(S(\theta))]`. Both have shape ``(n_c, l)``.
+    """
     pairs, h, finetuner = rope.pairs, rope.npe.h, rope.finetuner
     count = finetuner.simulations_per_target
     of_pairs = targets(rope.source, pairs, count, partial(embed, h))
@@ -121,8 +91,7 @@ def cross_fit(rope: RoPE, num_folds: int, *, show: bool) -> HeldOut:
     embedded = torch.empty_like(of_pairs)
     for number, held_out in enumerate(folds):
         embedded[held_out] = embed(nets.member(number), pairs.x[held_out])
-    moved = (values.cpu().double() for values in (embedded, of_pairs))
-    return HeldOut(*moved, group=pairs.group.cpu())
+    return embedded.cpu().double(), of_pairs.cpu().double()
 
 
 class PriorShift(NamedTuple):
@@ -140,45 +109,45 @@ class PriorShift(NamedTuple):
 
 
 def prior_shift(
-    real: Tensor, simulations: Simulations, held_out: HeldOut | None = None
+    real: Tensor,
+    theta: Tensor,
+    ends: Sequence[Tensor],
+    held_out: tuple[Tensor, Tensor, Tensor] | None = None,
 ) -> PriorShift:
     """Compare the parameters implied by a batch with those implied by simulations.
 
     The mean weights over the batch estimate the distribution of its parameters. They
     are blurred by gamma, by each posterior and by tuning, so that they understate a
     shift. Therefore the batch is compared with simulations that take the place of
-    observations, both unchanged and as tuning would move them.
+    observations. Of a tuned g there are two ``ends``: simulations as tuning would move
+    them, and unchanged. A g that was trained little is in between.
 
     A g that was tuned on few pairs misses its targets, and the batch looks shifted too.
-    The same distance is measured between calibration pairs that g has not seen and
-    their targets, and the 95 % quantile of its bootstrap is added to the threshold.
+    The same distance is measured between pairs that g has not seen and their targets
+    (``held_out``, with groups), and its 95 % quantile is added to the threshold.
     """
-    theta, embedded = simulations.theta, simulations.embedded
+    embedded = ends[-1]
     # At tau = 0 rows do not depend on one another, so that a few are enough.
     coupling = COUPLER.couple(embedded[:100], embedded)
     implied, functions = _implied_by(coupling, real, theta)
-    moved = simulations.averaged[:MAX_PLAYERS]
-    unshifted, expected = _implied_by(coupling, moved, theta, others=True)
-    # A g that was trained little averages less over noise. The threshold allows for the
-    # two ends, full averaging and none.
-    ends = [expected]
-    if simulations.tuned:
-        unmoved = embedded[:MAX_PLAYERS]
-        ends.append(_implied_by(coupling, unmoved, theta, others=True)[1])
+    players = [
+        _implied_by(coupling, end[:MAX_PLAYERS], theta, others=True) for end in ends
+    ]
+    unshifted, expected = players[0]
     chances = []
-    for end in ends:
+    for _, end in players:
         # The expectation is itself a mean over simulations, with its own uncertainty.
         gaps = _resampled(end, len(real)) - _resampled(expected, len(expected))
         largest = gaps.abs().amax(dim=-1)
         chances.append(largest.quantile(1.0 - LEVEL / theta.shape[1], dim=0))
     threshold = torch.stack(chances).amax(dim=0)
     if held_out is not None:
-        targets = simulations.average(held_out.targets)
-        _, found = _implied_by(coupling, held_out.embedded, theta)
+        points, targets, group = held_out
+        _, found = _implied_by(coupling, points, theta)
         _, wanted = _implied_by(coupling, targets, theta)
         # With few groups the errors could be small by chance, hence a bootstrap.
         one_each = torch.ones(len(found))
-        difference, _ = group_means(found - wanted, one_each, held_out.group)
+        difference, _ = group_means(found - wanted, one_each, group)
         largest = _resampled(difference, len(difference)).abs().amax(dim=-1)
         threshold = threshold + largest.quantile(ERROR_QUANTILE, dim=0)
     distance = (functions.mean(dim=0) - expected.mean(dim=0)).abs().amax(dim=-1)
@@ -187,21 +156,23 @@ def prior_shift(
 
 def shifts(
     shift: PriorShift,
-    simulations: Simulations,
+    theta: Tensor,
     names: Sequence[str],
     learned: Container[str],
+    *,
+    tuned: bool,
 ) -> list[Finding]:
     """Say for each parameter whether the batch has other values than the prior.
 
     A shift of parameters whose names are ``learned`` is no alarm.
     """
-    theta, weights = simulations.theta, torch.stack([shift.implied, shift.unshifted])
+    weights = torch.stack([shift.implied, shift.unshifted])
     standard = (theta - theta.mean(dim=0)) / divisors(theta.std(dim=0))
     mean = weights @ standard
     spread = (weights @ standard.square() - mean.square()).clamp_min(0.0).sqrt()
     move, ratio = mean[0] - mean[1], spread[0] / divisors(spread[1])
     doubt = "Without calibration pairs, misspecification looks the same."
-    if simulations.tuned:
+    if tuned:
         doubt = "In RoPE, lower tau. A stack needs pairs that are drawn like the batch."
     found = []
     for k, name in enumerate(names):
@@ -214,15 +185,13 @@ def shifts(
         numbers = f"distance {distance:.2g}, limit {threshold:.2g}"
         sentence = f"No sign of it ({numbers})."
         if distance > threshold:
-            is_alarming, higher = (
-                name not in learned,
-                "higher" if move[k] > 0 else "lower",
-            )
+            is_alarming = name not in learned
             expected = "This is expected: the stack has learned it from the pairs."
             sentence = (
                 f"The batch seems to differ from the prior in {name} ({numbers}). "
                 f"The mean is at least {abs(move[k]):.2f} prior standard deviations "
-                f"{higher}, and the spread {ratio[k]:.2f} times the usual. "
+                f"{'higher' if move[k] > 0 else 'lower'}, and the spread "
+                f"{ratio[k]:.2f} times the usual. "
                 f"{doubt if is_alarming else expected}"
             )
         found.append(Finding(test, sentence, is_alarming, distance, threshold))

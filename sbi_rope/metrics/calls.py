@@ -1,11 +1,8 @@
 """How metrics call a posterior: never in a loop without a bound.
 
-sbi's ``DirectPosterior`` rejects samples outside the prior, and divides its density by
-the share that it keeps. If a misspecified observation has moved all mass out of the
-prior, these loops never end. Metrics take such a posterior as its network states it:
-samples are not rejected, and ``log_prob`` is not normalised, although it is still minus
-infinity outside the prior. Posteriors that bound the loop, such as those of this
-package, are called as they are.
+Of sbi's own posteriors, samples are not rejected and ``log_prob`` is not normalised,
+although it is minus infinity outside the prior. Posteriors that bound these loops, such
+as those of this package, are called as they are.
 """
 
 import warnings
@@ -21,10 +18,6 @@ from sbi_rope.utils.errors import InvalidInputError
 from sbi_rope.utils.settings import Range, check
 from sbi_rope.utils.tensors import as_batch, as_numbers, rows_with
 
-# The most draws for one observation. More would fill the memory without making any
-# score more precise.
-MAX_SAMPLES = 10**8
-
 # sbi warns of samples that are not rejected, and of whole chunks that are sampled at
 # once. Both are done here on purpose.
 EXPECTED_WARNINGS = (
@@ -38,9 +31,8 @@ def draw_samples(posterior: Any, x: Tensor, *, num_samples: int) -> Tensor:
 
     ``sample`` and ``sample_batched`` of an sbi posterior reject samples outside the
     prior until enough lie inside. On real observations all may lie outside, and the
-    call does not return unless ``max_sampling_time`` bounds it. ``log_prob`` estimates
-    the share inside by the same loop, except with ``norm_posterior=False``. This
-    function returns what the network draws.
+    call does not return unless ``max_sampling_time`` bounds it. This function returns
+    what the network draws.
 
     Args:
         posterior: Any posterior with ``sample_batched``.
@@ -53,9 +45,9 @@ def draw_samples(posterior: Any, x: Tensor, *, num_samples: int) -> Tensor:
 
     Raises:
         InvalidInputError: If the posterior returns NaN or a wrong shape, ``x`` is empty
-            or cannot be read, or ``num_samples`` is not from 1 to 10^8.
+            or cannot be read, or ``num_samples`` is below 1.
     """
-    check("num_samples", num_samples, Annotated[int, Range(1, MAX_SAMPLES)])
+    check("num_samples", num_samples, Annotated[int, Range(1)])
     return samples_of(posterior, read_x(posterior, x), num_samples)
 
 

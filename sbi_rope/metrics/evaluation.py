@@ -16,13 +16,7 @@ from sbi_rope.data.pairs import (
     groups_of,
     one_of_each_group,
 )
-from sbi_rope.metrics.calls import (
-    MAX_SAMPLES,
-    log_probs_of,
-    read_theta,
-    read_x,
-    samples_of,
-)
+from sbi_rope.metrics.calls import log_probs_of, read_theta, read_x, samples_of
 from sbi_rope.metrics.statistics import Estimate
 from sbi_rope.npe.prior import PriorDistribution
 from sbi_rope.utils.errors import InvalidInputError
@@ -43,12 +37,11 @@ FALSE_ALARMS = 0.05
 NOMINAL = torch.arange(1, 100, dtype=torch.double) / 100
 # Levels are ratios of integers. Those that are equal before rounding must be after it.
 ROUNDING = 1e-9
-ACAUC_IN_WORDS = "0 is calibrated, positive is over-confident, negative is too wide"
 # How many observations a posterior is called with at a time.
 CHUNK_SIZE = 100
 # By a single draw all posteriors look calibrated whose draws are too large as often as
 # too small.
-NumSamples = Annotated[int, Range(20, MAX_SAMPLES)]
+NumSamples = Annotated[int, Range(20)]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -97,12 +90,15 @@ class Evaluation:
         return self._number(torch.ones(len(self)))
 
     def _number(self, is_known: Tensor) -> float:
-        weight = is_known.double().cpu()
-        if self.weight is not None:
-            weight = weight * self.weight.cpu()
+        weight = self._weight * is_known.cpu()
         if self.group is not None:
             weight = group_means(weight, weight, self.group.cpu())[1]
         return effective_number(weight)
+
+    @property
+    def _weight(self) -> Tensor:
+        weight = torch.ones(len(self)) if self.weight is None else self.weight
+        return weight.double().cpu()
 
     def mean(self, values: Tensor, *, confidence: float = 0.95) -> Estimate:
         """Return the mean over observations of one number each, shape ``(n,)``."""
@@ -146,9 +142,8 @@ class Evaluation:
             - \mathbf{1}[\theta_{ij} \in \Theta_{ij}(\alpha)] \,\mathrm{d}\alpha
             = \frac{1}{d n} \sum_{j, i} a^*_{ij} - \frac{1}{2}
 
-        The interval is wider than that of other means by :math:`\sqrt{n / (n - 1)}`.
-        Without this factor, it would be too narrow for a few uniform levels. With it,
-        the interval leaves 0 out for 4 to 5 % of calibrated posteriors, with 10 to 50
+        The interval is wider than that of other means by :math:`\sqrt{n / (n - 1)}`, so
+        that it leaves 0 out for 4 to 5 % of calibrated posteriors, with 10 to 50
         observations and one to five parameters. The paper is that of :attr:`lpp`.
         """
         return self._acauc(self.levels.nanmean(dim=1), 0.95)
@@ -157,8 +152,8 @@ class Evaluation:
     def acauc_of_parameters(self) -> tuple[Estimate, ...]:
         """The ACAUC of each parameter alone.
 
-        The intervals of d calibrated parameters all hold 0 in at least 95 % of the
-        cases (Bonferroni).
+        The intervals of d calibrated parameters all hold 0 in about 95 % of the cases
+        (Bonferroni).
         """
         columns = self.levels.unbind(dim=1)
         return tuple(self._acauc(one, 1 - 0.05 / len(columns)) for one in columns)
@@ -176,24 +171,13 @@ class Evaluation:
         Of each parameter, shape ``(99, d)``; NaN if it is not known anywhere. It is
         exact to about one over the number of samples behind the ranks.
         """
-        levels, known = self.levels, ~self.ranks.isnan()
-        weight = torch.ones(len(self)) if self.weight is None else self.weight
-        weights = weight.to(levels)[:, None] * known
+        levels = self.levels
+        weights = self._weight.to(levels)[:, None] * ~levels.isnan()
         shares = [
             (weights * (levels <= level + ROUNDING)).sum(dim=0)
             for level in NOMINAL.tolist()
         ]
         return torch.stack(shares) / weights.sum(dim=0)
-
-    @property
-    def expected_coverage_error(self) -> float:
-        r"""The mean distance of the coverage from the level, over all parameters.
-
-        Over-confidence in one parameter cannot cancel under-confidence in another. A
-        calibrated posterior has about :math:`0.31 / \sqrt{n}`.
-        """
-        coverage = self.coverage
-        return float((coverage - NOMINAL[:, None].to(coverage)).abs().nanmean())
 
     @property
     def dependence(self) -> tuple[float, ...]:
@@ -203,9 +187,8 @@ class Evaluation:
         parameters. The ranks u and the levels :math:`|2u - 1|` are regressed on the
         ranks of the posterior means and on their squares: u shows a bias, and the level
         a wrong width, that differ from region to region. The permutation test is exact
-        if the posterior is calibrated, and does not react to errors that are the same
-        everywhere. One observation of each group is tested. The p-value of a parameter
-        is NaN with fewer than ten observations.
+        if the posterior is calibrated. One observation of each group is tested. The
+        p-value of a parameter is NaN with fewer than ten observations.
 
         References:
             | Validating Bayesian Inference Algorithms with Simulation-Based Calibration
@@ -219,46 +202,29 @@ class Evaluation:
         columns = zip(ranks.T, means.T, tested.T, strict=True)
         return tuple(_p_value(u[rows], mean[rows]) for u, mean, rows in columns)
 
-    def as_row(self) -> dict[str, float]:
-        """Return the main scores as the row of a table; an unknown one is NaN."""
-        return {
-            "lpp": self.lpp.mean,
-            "lpp_z": self.lpp_z.mean,
-            "acauc": self.acauc.mean,
-            "expected_coverage_error": self.expected_coverage_error,
-        }
-
     def lines(self, *, known: str = "true parameters") -> list[tuple[str, bool]]:
-        """Return sentences about the calibration, and whether each is alarming.
-
-        Args:
-            known: What the intervals should hold.
-        """
-        n, verdict = self.num_independent, verdict_of(self.acauc)
-        if verdict == "unknown":
-            return [("Whether it is calibrated is not known.", False)]
-        acauc = f"ACAUC {self.acauc:+.3f}; {ACAUC_IN_WORDS}"
-        if n < FEWEST:
-            return [(f"Too few observations to check calibration: {acauc}.", False)]
-        off, unknown = [], []
+        """Return sentences about the calibration, and whether each is alarming."""
+        n, acauc = self.num_independent, self.acauc
+        if n < FEWEST or math.isnan(acauc.low):
+            return [("Too few known parameters to check calibration.", False)]
+        verdict, off, unknown = _verdict(acauc), [], []
         for name, one in zip(self.names, self.acauc_of_parameters, strict=True):
-            alone = verdict_of(one)
+            alone = _verdict(one)
             if math.isnan(one.mean):
                 text = f"{name} was not measured, so its width is not checked."
                 unknown.append((text, False))
-            elif alone in ("over-confident", "too wide") and len(self.names) > 1:
+            elif alone != "calibrated" and len(self.names) > 1:
                 off.append((f"{name} alone is {alone}: ACAUC {one:+.3f}.", True))
         start = f"The posterior is {verdict}"
         if verdict == "calibrated":
             average = ", on average over parameters," if off else ""
             what = "observations" if self.group is None else "groups"
             start = f"Calibrated{average} as far as {n:.0f} {what} can tell"
+        start += f": ACAUC {acauc:+.3f}; 0 is calibrated, positive is over-confident, "
+        first = f"{start}negative is too wide.", verdict != "calibrated"
         half, most = self.coverage[[49, 89]].nanmean(dim=1).tolist()
-        shares = (
-            f"50% intervals hold {half:.0%} of the {known}, {LEVEL:.0%} intervals "
-            f"{most:.0%}."
-        )
-        first = f"{start}: {acauc}.", verdict != "calibrated"
+        shares = f"50% intervals hold {half:.0%} of the {known}, "
+        shares += f"{LEVEL:.0%} intervals {most:.0%}."
         return [first, *off, *unknown, (shares, False), *self._dependence_lines(known)]
 
     def _dependence_lines(self, known: str) -> list[tuple[str, bool]]:
@@ -266,30 +232,29 @@ class Evaluation:
         tested = [p for p in p_values if not math.isnan(p)]
         for k, p_value in enumerate(p_values):
             if p_value * len(tested) < FALSE_ALARMS:  # Bonferroni
-                text = f"The coverage of {self.names[k]} depends on its estimate (p = "
-                text += f"{p_value:.1g}). {self._in_thirds(k, known)}"
+                inside, above = self._in_thirds(k)
+                text = (
+                    f"The coverage of {self.names[k]} depends on its estimate (p = "
+                    f"{p_value:.1g}). In the lowest, middle and highest third of the "
+                    f"estimates, {LEVEL:.0%} intervals hold {inside} of the {known}, "
+                    f"and {above} are above the median."
+                )
                 lines.append((text, True))
         if tested and not lines:
             text = "No sign that coverage depends on the estimate (smallest p-value of "
             lines.append((f"{text}{len(tested)}: {min(tested):.2g}).", False))
         return lines
 
-    def _in_thirds(self, column: int, known: str) -> str:
+    def _in_thirds(self, column: int) -> list[str]:
         ranks, estimates = self.ranks[:, column].cpu(), self.estimates[:, column].cpu()
         rows = (~ranks.isnan()).nonzero().flatten()
         thirds = rows[estimates[rows].argsort(stable=True)].tensor_split(3)
-        weight = torch.ones(len(self)) if self.weight is None else self.weight.cpu()
-        is_inside = self.levels[:, column].cpu() <= LEVEL + ROUNDING
-        inside, above = (
-            "{:.0%}, {:.0%} and {:.0%}".format(
-                *((weight * event)[i].sum() / weight[i].sum() for i in thirds)
-            )
-            for event in (is_inside, ranks > 0.5)
-        )
-        return (
-            f"In the lowest, middle and highest third of the estimates, {LEVEL:.0%} "
-            f"intervals hold {inside} of the {known}, and {above} are above the median."
-        )
+        weight, levels = self._weight, self.levels[:, column].cpu()
+        texts = []
+        for event in (levels <= LEVEL + ROUNDING, ranks > 0.5):
+            shares = ((weight * event)[i].sum() / weight[i].sum() for i in thirds)
+            texts.append("{:.0%}, {:.0%} and {:.0%}".format(*shares))
+        return texts
 
     def __str__(self) -> str:
         n, d = self.ranks.shape
@@ -299,9 +264,8 @@ class Evaluation:
             f"  LPP, the log density of the true parameters: {self.lpp:.2f} nats",
         ]
         if not math.isnan(self.lpp_z.mean):
-            lines.append(
-                f"  LPP with theta in prior standard deviations: {self.lpp_z:.2f}"
-            )
+            text = f"  LPP with theta in prior standard deviations: {self.lpp_z:.2f}"
+            lines.append(text)
         if excluded := float(torch.isneginf(self.log_prob).double().mean()):
             lines.append(
                 f"  {excluded:.1%} of the true parameters have density zero: they are "
@@ -316,14 +280,7 @@ class Evaluation:
     __repr__ = __str__  # which notebooks show
 
 
-def verdict_of(acauc: Estimate) -> str:
-    """Return "over-confident", "too wide", "calibrated" or "unknown".
-
-    It is "calibrated" unless the interval leaves 0 out, and "unknown" if nothing was
-    scored.
-    """
-    if math.isnan(acauc.low):
-        return "unknown"
+def _verdict(acauc: Estimate) -> str:
     if acauc.low > 0:
         return "over-confident"
     return "too wide" if acauc.high < 0 else "calibrated"
@@ -415,14 +372,8 @@ def estimates_and_ranks(samples: Tensor, theta: Tensor) -> tuple[Tensor, Tensor]
         + v \, \big(1 + \#\{m: \theta^m = \theta\}\big) \Big)
 
     with v one half, or uniform where samples are equal to theta, so that the ranks of
-    discrete parameters are uniform, too, if the posterior is calibrated.
-
-    Args:
-        samples: Posterior samples, shape ``(num_samples, n, d)``.
-        theta: True parameters, shape ``(n, d)``.
-
-    Returns:
-        Both of shape ``(n, d)``, float64.
+    discrete parameters are uniform, too, if the posterior is calibrated. Samples
+    ``(num_samples, n, d)`` and theta ``(n, d)`` give two float64 tensors ``(n, d)``.
     """
     # Not the first fifth, in case samples are sorted by component.
     is_mean = torch.arange(len(samples), device=samples.device) % 5 == 0

@@ -26,19 +26,11 @@ NUM_FOR_ESTIMATE = 20
 FARTHEST = 10.0
 
 
-# Means --------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Estimate:
     """A mean with the ends of its interval, which are NaN for a single value.
 
     Formatting applies to all three numbers.
-
-    Attributes:
-        mean: The mean.
-        low: The lower end.
-        high: The upper end.
     """
 
     mean: float
@@ -60,15 +52,9 @@ class Estimate:
             \frac{\sum_g w_g^2 (v_g - \bar v)^2}{(\sum_g w_g)^2}}, \qquad
             n = \frac{(\sum_g w_g)^2}{\sum_g w_g^2}
 
-        A few groups that weigh as much as all others tell as little as so few alone.
-
-        Args:
-            values: A number for each pair, shape ``(n,)``. NaN is left out. The
-                interval has no ends if a value is infinite.
-            weight: The weight of each pair; one each if None.
-            group: A number for each pair. The interval takes the means of groups for
-                independent. None if all pairs are.
-            confidence: The probability of the interval.
+        Values, weights and groups have shape ``(n,)``. NaN is left out, and the
+        interval has no ends if a value is infinite. Weights are one each if None. The
+        interval takes the means of groups for independent; all pairs are if None.
 
         Example:
             >>> print(f"{Estimate.of(torch.tensor([1.0, 2.0, 3.0])):.2f}")
@@ -100,9 +86,6 @@ class Estimate:
         return format(self, ".3g")
 
 
-# Whether two sets come from one distribution ------------------------------------------
-
-
 @dataclass(frozen=True, kw_only=True)
 class TwoSampleTest:
     """The outcome of a permutation test of two sets.
@@ -110,8 +93,6 @@ class TwoSampleTest:
     Attributes:
         p_value: The share of random divisions of all rows into two sets that differ at
             least as much as the two sets, in the embeddings or in an estimate.
-        spread: How far apart the embeddings of the second set are on average, as a
-            multiple of the same distance in the first set.
         p_values: The same share for each parameter alone, with the divisions that
             differ as much in any respect, ``(d,)``.
         spreads: The standard deviation of the estimates of each parameter in the second
@@ -119,7 +100,6 @@ class TwoSampleTest:
     """
 
     p_value: float
-    spread: float
     p_values: tuple[float, ...] = ()
     spreads: tuple[float, ...] = ()
 
@@ -140,39 +120,28 @@ class TwoSampleTest:
 
 @torch.no_grad()
 def compare_with_pairs(
-    labelled: Tensor,
-    groups: Tensor,
-    batch: Tensor,
-    density: Any = None,
+    labelled: Tensor, groups: Tensor, batch: Tensor, density: Any
 ) -> TwoSampleTest | None:
     r"""Test whether a batch is like the observations of calibration pairs.
 
     The statistic is the energy distance
     :math:`2\,E\|X - Y\| - E\|X - X'\| - E\|Y - Y'\|`, which is zero only if the two
-    distributions are the same. It is computed of the embeddings, and of the estimates
-    of each parameter alone, which show a narrower or a shifted range of one of them.
+    distributions are the same. It is computed of the embeddings ``(n, l)`` and
+    ``(m, l)``, and of the estimates of each parameter alone by ``density``,
+    :math:`q(\theta \mid h)`, which show a narrower or a shifted range of one of them.
     Each of these distances is divided by its mean over random divisions of all rows,
-    and the largest counts. Among two sets of one distribution, one in a hundred has a
-    p-value below 0.01, whatever the distribution.
+    and the largest counts.
 
     Each column is divided by its standard deviation in both sets together. Entries that
     are far from all others are moved closer first. Otherwise a single one could hide
-    that the sets differ.
+    that the sets differ. Pairs of one group, ``(n,)``, resemble each other, so that one
+    of them is used. At most 500 random rows of each set are used.
+
+    The outcome is always the same for the same sets. It is None if one of the sets has
+    fewer than five rows.
 
     References:
         | Testing for Equal Distributions in High Dimension (Szekely and Rizzo, 2004)
-
-    Args:
-        labelled: The embeddings of the pairs, shape ``(n, l)``; the first set. Pairs of
-            one group resemble each other, so that one of them is used. At most 500
-            random rows are used.
-        groups: The group of each pair, shape ``(n,)``.
-        batch: The embeddings of the batch, shape ``(m, l)``; at most 500, too.
-        density: :math:`q(\theta \mid h)` of NPE, whose estimates are compared as well.
-
-    Returns:
-        The outcome, which is always the same for the same sets. None if one of the sets
-        has fewer than five rows.
     """
     first = labelled[one_of_each_group(groups, seed=0).to(labelled.device)]
     if min(len(first), len(batch)) < FEWEST:
@@ -186,16 +155,13 @@ def compare_with_pairs(
         member[0, :n] = 1.0
         for i in range(1, NUM_DIVISIONS + 1):
             member[i, torch.randperm(n + m)[:n]] = 1.0
-        estimates = rows[:, :0]
-        if density is not None:
-            draws = torch.Size((NUM_FOR_ESTIMATE,))
-            estimates = density.sample(draws, condition=rows).mean(dim=0)
+        draws = torch.Size((NUM_FOR_ESTIMATE,))
+        estimates = density.sample(draws, condition=rows).mean(dim=0)
     # Far from all simulations, a network may return anything.
     estimates = estimates.cpu().double().nan_to_num()
     compared = [rows.cpu().double(), *estimates.T[..., None]]
-    found = [_energies(_closer(columns), member) for columns in compared]
     # The energy distances of each division, and how much larger than usual they are.
-    energies = torch.stack([energy for energy, _ in found], dim=1)
+    energies = torch.stack([_energies(_closer(one), member) for one in compared], dim=1)
     excess = energies / divisors(energies.mean(dim=0))
     largest = excess.amax(dim=1)
     # A division that is equal up to rounding counts, and so does the one at hand.
@@ -204,18 +170,15 @@ def compare_with_pairs(
     of_sets = [column.split([n, m]) for column in estimates.T]
     return TwoSampleTest(
         p_value=min(each),
-        spread=found[0][1],
         p_values=tuple(each[1:]),
         spreads=tuple(float(b.std() / divisors(a.std())) for a, b in of_sets),
     )
 
 
-def _energies(rows: Tensor, member: Tensor) -> tuple[Tensor, float]:
+def _energies(rows: Tensor, member: Tensor) -> Tensor:
     """Return the energy distance of each division of rows ``(n + m, l)``.
 
-    In ``member``, ``(divisions, n + m)``, the first set of each division has ones. The
-    second value is the spread of the second set in the first division, as a multiple
-    of that of the first set.
+    In ``member``, ``(divisions, n + m)``, the first set of each division has ones.
     """
     # Of two equal rows, only rounding would be left to compare.
     std = rows.std(dim=0)
@@ -230,9 +193,7 @@ def _energies(rows: Tensor, member: Tensor) -> tuple[Tensor, float]:
     within = (of_first * member).sum(dim=1) / n**2
     across = (of_first * rest).sum(dim=1) / (n * m)
     other = (of_second * rest).sum(dim=1) / m**2
-    # Of rows that are all equal the ratio is NaN.
-    spread = (other[0] * m / (m - 1)) / (within[0] * n / (n - 1))
-    return 2 * across - within - other, float(spread)
+    return 2 * across - within - other
 
 
 def _closer(rows: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from sbi_rope.data.parameters import is_improbable
 from sbi_rope.density.sets import SetScores, rank_needed
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.metrics import Evaluation
-from sbi_rope.metrics.evaluation import FEWEST, LEVEL, verdict_of
+from sbi_rope.metrics.evaluation import FEWEST, LEVEL
 from sbi_rope.metrics.statistics import Estimate, TwoSampleTest
 from sbi_rope.utils.settings import Count, check
 
@@ -291,10 +291,7 @@ def _trust(report: StackingReport) -> Iterator[Line]:
         return
     known = "parameters" if report.are_exact else "labels"
     yield from held_out.lines(known=known)
-    if (
-        verdict_of(held_out.acauc) == "over-confident"
-        and held_out.num_independent >= FEWEST
-    ):
+    if held_out.acauc.low > 0 and held_out.num_independent >= FEWEST:
         advice = "Collect more labels, or ask for intervals with `guaranteed=True`."
         yield advice, True
     if is_improbable(report.probability_of_prior):

@@ -423,7 +423,7 @@ def test_a_page_says_what_printing_says_and_needs_no_other_file(
     torch.manual_seed(0)
     options: dict[str, Any] = {"num_simulations": 100, "num_folds": None, **QUIET}
     diagnosis = diagnose(trained(), observed(), seed=0, **options)
-    unlike = TwoSampleTest(p_value=0.002, spread=0.3)
+    unlike = TwoSampleTest(p_value=0.002)
     held_out = the_stack().report.held_out
     # The coverage of the first parameter depends on its estimate.
     ranks, n = held_out.ranks.clone(), len(held_out)

@@ -14,10 +14,9 @@ from torch.distributions import Normal
 
 from sbi_rope import metrics
 from sbi_rope.metrics import Estimate, Evaluation
-from sbi_rope.metrics.evaluation import NOMINAL, estimates_and_ranks, verdict_of
+from sbi_rope.metrics.evaluation import NOMINAL, estimates_and_ranks
 from sbi_rope.utils.errors import InvalidInputError
 from tests import gaussian
-from tests.refusals import assert_refused
 
 NORMAL = Normal(torch.tensor(0.0, dtype=torch.float64), 1.0)
 torch.manual_seed(0)
@@ -29,18 +28,14 @@ GROUP = torch.arange(12).repeat_interleave(4)
 class GaussianPosterior:
     """N(x + bias, scale^2) in every dimension, in sbi's shapes."""
 
-    def __init__(self, bias: float = 0.0, scale: float | Tensor = 1.0) -> None:
-        self.bias, self.scale = bias, torch.as_tensor(scale)
+    def __init__(self, bias: float = 0.0, scale: float = 1.0) -> None:
+        self.bias, self.scale = bias, scale
 
-    def sample_batched(
-        self, sample_shape: torch.Size, x: Tensor, show_progress_bars: bool = True
-    ) -> Tensor:
-        noise = torch.randn(*sample_shape, *x.shape, dtype=x.dtype)
-        return x + self.bias + self.scale * noise
+    def sample_batched(self, sample_shape: Any, x: Tensor, **options: Any) -> Tensor:
+        return Normal(x + self.bias, self.scale).sample(sample_shape)
 
     def log_prob_batched(self, theta: Tensor, x: Tensor) -> Tensor:
-        theta = theta if theta.ndim > 2 else theta.unsqueeze(0)
-        return Normal(x + self.bias, self.scale).log_prob(theta).sum(dim=-1)
+        return Normal(x + self.bias, self.scale).log_prob(theta[None]).sum(dim=-1)
 
 
 def gaussian_pairs(n: int, d: int = 1) -> tuple[Tensor, Tensor]:
@@ -60,9 +55,6 @@ def scored(
 
 def half(found: Estimate) -> float:
     return (found.high - found.low) / 2
-
-
-# Means --------------------------------------------------------------------------------
 
 
 def test_an_interval_holds_the_mean_as_often_if_one_pair_counts_as_all_others() -> None:
@@ -104,46 +96,20 @@ def test_a_weight_counts_as_so_many_pairs_and_nan_is_left_out() -> None:
     found = scored(ranks, weight=times.double())
     several = scored(ranks.repeat_interleave(times, dim=0))
     assert found.acauc.mean == pytest.approx(several.acauc.mean)
-    torch.testing.assert_close(found.coverage, several.coverage)
-    assert found.expected_coverage_error == pytest.approx(
-        several.expected_coverage_error
-    )
+    for k, column in enumerate(several.ranks.T):
+        known = scored(column[~column.isnan(), None])
+        torch.testing.assert_close(found.coverage[:, k], known.coverage[:, 0])
 
 
-# Ranks --------------------------------------------------------------------------------
-
-
-class Coin:
-    """The exact posterior of a coin that shows its side in 95 % of the cases."""
-
-    def sample_batched(
-        self, sample_shape: torch.Size, x: Tensor, show_progress_bars: bool = True
-    ) -> Tensor:
-        return torch.bernoulli((0.05 + 0.9 * x).expand(*sample_shape, *x.shape))
-
-    def log_prob_batched(self, theta: Tensor, x: Tensor) -> Tensor:
-        probability = torch.where(theta == x, 0.95, 0.05)
-        return probability.log().sum(dim=-1).reshape(-1, len(x))
-
-
-@pytest.mark.medium
-def test_an_exact_posterior_of_a_discrete_parameter_is_calibrated(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+@pytest.mark.parametrize("chance", [0.5, 0.95])
+def test_ranks_of_a_discrete_parameter_are_uniform(chance: float) -> None:
     torch.manual_seed(0)
-    theta = torch.bernoulli(torch.full((500, 1), 0.5))
-    x = torch.where(torch.rand(500, 1) < 0.95, theta, 1 - theta)
-    # In chunks, which must not repeat the same random numbers.
-    for chunk_size in (1, 500):
-        monkeypatch.setattr("sbi_rope.metrics.evaluation.CHUNK_SIZE", chunk_size)
-        found = metrics.evaluate(Coin(), theta, x, num_samples=200, seed=0)
-        assert verdict_of(found.acauc) == "calibrated"
-        assert abs(found.acauc.mean) < 0.04
-        assert found.expected_coverage_error < 0.04
+    draws = torch.bernoulli(torch.full((201, 500, 1), chance))
+    ranks = estimates_and_ranks(draws[1:], draws[0])[1]
+    assert kstest(ranks[:, 0], "uniform").pvalue > 0.01
 
 
 def test_means_and_ranks_come_from_different_samples() -> None:
-    """Of the same samples, those too high by chance raise the mean, lower the rank."""
     generator = torch.Generator().manual_seed(2)
     samples = torch.randn(10, 5000, 1, generator=generator)
     theta = torch.randn(5000, 1, generator=generator)
@@ -158,12 +124,6 @@ def test_coverage_counts_a_level_that_is_equal_to_the_nominal_one() -> None:
     assert found.coverage[[0, 55, 56, 98], 0].tolist() == [0.5, 0.5, 1.0, 1.0]
 
 
-def test_coverage_error_does_not_cancel_over_parameters() -> None:
-    found = scored(torch.tensor([[0.5, 1.0]] * 10))
-    assert found.acauc.mean == 0.0
-    assert found.expected_coverage_error == pytest.approx(0.5)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("n", "d", "copies"), [(10, 1, 1), (10, 3, 1), (10, 1, 3)])
 def test_calibrated_ranks_of_ten_seldom_have_an_interval_without_zero(
@@ -173,28 +133,14 @@ def test_calibrated_ranks_of_ten_seldom_have_an_interval_without_zero(
     wrong = 0
     for _ in range(1000):
         levels = torch.rand(n, d, generator=generator).repeat(1, copies)
-        wrong += verdict_of(scored((1 + levels) / 2).acauc) != "calibrated"
+        found = scored((1 + levels) / 2).acauc
+        wrong += found.low > 0 or found.high < 0
     # In many more draws it is 4 to 5 %; with two standard errors it would be 8 %.
     assert 0.02 < wrong / 1000 < 0.06
 
 
-def test_levels_too_large_are_over_confident_and_too_small_too_wide() -> None:
-    levels = torch.rand(60, 2, generator=torch.Generator().manual_seed(0))
-    assert verdict_of(scored((1 + levels.sqrt()) / 2).acauc) == "over-confident"
-    found = scored((1 + levels.square()) / 2).acauc
-    assert verdict_of(found) == "too wide"
-    assert found.low < found.mean < found.high < 0.0
-
-
-# Posteriors with known scores ---------------------------------------------------------
-
-
 def expected_acauc(bias: float, scale: float, *, num_ranks: int) -> float:
-    """Integrate the mean level over the distribution of the truth, N(0, 1).
-
-    For many samples the rank is normal around the distribution function. The level is
-    then folded normal, whose mean is at least about 1 / sqrt(M).
-    """
+    """Integrate the mean level, folded normal for many samples, over the truth."""
     z = torch.linspace(-9, 9, 20001, dtype=torch.float64)
     rank = NORMAL.cdf((z - bias) / scale)
     level = (2 * rank - 1).abs()
@@ -211,20 +157,15 @@ def test_acauc_of_gaussian_posteriors_has_its_exact_and_its_published_value() ->
     for bias, scale, published in (
         (0.0, 1.0, 0.0015),  # calibrated
         (0.0, 0.3, 0.3127),  # over-confident
-        (0.0, 0.01, 0.492),
         (0.0, 3.0, -0.298),  # under-confident
-        (0.0, 100.0, -0.474),
         (2.0, 1.0, 0.356),  # too high
-        (-2.0, 1.0, 0.354),  # too low
-        (50.0, 0.1, 0.499),
     ):
         posterior = GaussianPosterior(bias, scale)
         found = metrics.evaluate(posterior, theta, x, num_samples=1250).acauc
         exact = expected_acauc(bias, scale, num_ranks=1000)
-        case = f"bias {bias} and scale {scale}: {found}"
         # 0.001: finitely many samples; 0.002: the error of the published value.
-        assert abs(found.mean - exact) < 2 * half(found) + 0.001, case
-        assert abs(found.mean - published) < 2 * half(found) + 0.002, case
+        assert abs(found.mean - exact) < 2 * half(found) + 0.001
+        assert abs(found.mean - published) < 2 * half(found) + 0.002
 
 
 def test_coverage_of_gaussian_posteriors_follows_its_formula() -> None:
@@ -235,19 +176,13 @@ def test_coverage_of_gaussian_posteriors_follows_its_formula() -> None:
     # Four standard errors of a share, and a step of the ranks.
     error = 4 * (expected * (1 - expected) / 2000).sqrt() + 0.004
     assert ((found.coverage - expected[:, None]).abs() < error[:, None]).all()
-    distance = float((NOMINAL - expected).mean())
-    assert found.expected_coverage_error == pytest.approx(distance, abs=0.02)
-    calibrated = metrics.evaluate(GaussianPosterior(), theta, x)
-    assert calibrated.expected_coverage_error < 4 * 0.313 / 2000**0.5
 
 
 def test_lpp_of_a_gaussian_matches_its_closed_form_in_any_unit() -> None:
     torch.manual_seed(0)
     theta, x = gaussian_pairs(4000, d=2)
     std = torch.tensor([3.0, 0.25])
-    found = metrics.evaluate(
-        GaussianPosterior(0.5, 2.0), theta, x, theta_std=std, num_samples=20
-    )
+    found = metrics.evaluate(GaussianPosterior(0.5, 2.0), theta, x, theta_std=std)
     # -log s - log(2 pi)/2 - (1 + b^2) / (2 s^2), and the variance of the last term.
     expected = 2 * (-math.log(2.0) - 0.5 * math.log(2 * math.pi) - 1.25 / 8)
     variance = 2 * (2 + 4 * 0.25) / (4 * 2.0**4)
@@ -258,15 +193,10 @@ def test_lpp_of_a_gaussian_matches_its_closed_form_in_any_unit() -> None:
     assert found.lpp_z.mean == pytest.approx(float(scaled.mean()), abs=1e-4)
 
 
-# Dependence on the estimate -----------------------------------------------------------
-
-
-def estimated(n: int = 300, seed: int = 0) -> tuple[Tensor, Tensor]:
+def estimated() -> tuple[Tensor, Tensor]:
     """Parameters of a linear-Gaussian problem, and their exact posterior means."""
-    generator = torch.Generator().manual_seed(seed)
-    theta = torch.randn(n, 1, generator=generator)
-    noise = gaussian.NOISE_STD * torch.randn(n, 1, generator=generator)
-    return theta, gaussian.GAIN * (theta + noise)
+    theta, noise = torch.randn(2, 300, 1, generator=torch.Generator().manual_seed(0))
+    return theta, gaussian.GAIN * (theta + gaussian.NOISE_STD * noise)
 
 
 def ranks_in(theta: Tensor, mean: Tensor, std: Tensor | float) -> Tensor:
@@ -276,41 +206,28 @@ def ranks_in(theta: Tensor, mean: Tensor, std: Tensor | float) -> Tensor:
 
 @pytest.mark.medium
 def test_p_values_of_calibrated_posteriors_are_uniform() -> None:
-    """This holds for estimates of any distribution, and with few observations."""
     generator = torch.Generator().manual_seed(0)
-    found = scored(
-        torch.rand(15, 100, generator=generator),
-        torch.randn(15, 100, generator=generator).exp(),
-    )
+    ranks = torch.rand(15, 100, generator=generator)
+    found = scored(ranks, torch.randn(15, 100, generator=generator).exp())
     assert kstest(found.dependence, "uniform").pvalue > 0.01
 
 
-@pytest.mark.parametrize("error", ["slope", "curve", "width in the tail", "width"])
-def test_errors_that_depend_on_the_estimate_are_found(error: str) -> None:
-    theta, mean = estimated()
-    std: Tensor | float = gaussian.POSTERIOR_STD
-    if error == "slope":
-        mean = 1.3 * mean
-    elif error == "curve":
-        mean = mean + 0.2 * (mean.square() - mean.square().mean())
-    elif error == "width in the tail":
-        std = torch.where(mean.abs() > mean.std(), 0.5 * std, std)
-    else:
-        std = std * (0.5 * mean).exp()
-    assert scored(ranks_in(theta, mean, std), mean).dependence[0] < 0.05
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize(("shift", "factor"), [(0.0, 1.0), (0.3, 1.0), (0.0, 0.5)])
-def test_errors_that_are_the_same_everywhere_are_not_reported(
-    shift: float, factor: float
+@pytest.mark.parametrize(
+    ("mean_of", "std_of"),
+    [
+        (lambda mean: 1.3 * mean, torch.ones_like),
+        (lambda mean: mean + 0.2 * (mean.square() - 0.8), torch.ones_like),
+        (lambda mean: mean, lambda mean: (0.5 * mean).exp()),
+        (lambda mean: mean, lambda mean: 1.0 - 0.5 * (mean.abs() > mean.std())),
+    ],
+    ids=["slope", "curve", "width", "width in the tail"],
+)
+def test_errors_that_depend_on_the_estimate_are_found(
+    mean_of: Any, std_of: Any
 ) -> None:
-    p_values = []
-    for seed in range(25):
-        theta, mean = estimated(60, seed)
-        ranks = ranks_in(theta, mean + shift, factor * gaussian.POSTERIOR_STD)
-        p_values += scored(ranks, mean).dependence
-    assert kstest(p_values, "uniform").pvalue > 0.01
+    theta, mean = estimated()
+    ranks = ranks_in(theta, mean_of(mean), gaussian.POSTERIOR_STD * std_of(mean))
+    assert scored(ranks, mean_of(mean)).dependence[0] < 0.05
 
 
 def test_coverage_is_said_for_each_third_of_the_estimates() -> None:
@@ -328,58 +245,51 @@ def test_coverage_is_said_for_each_third_of_the_estimates() -> None:
     assert math.isnan(found.dependence[1])
 
 
-def test_one_known_pair_of_each_group_is_tested() -> None:
+def test_one_pair_of_each_group_is_tested() -> None:
     theta, mean = estimated()
-    ranks = ranks_in(theta, 1.02 * mean, gaussian.POSTERIOR_STD)
-    group = torch.arange(300).repeat(20)
-    twins = scored(ranks.repeat(20, 1), mean.repeat(20, 1), group=group)
+    ranks = ranks_in(theta, 1.02 * mean, gaussian.POSTERIOR_STD).repeat(20, 1)
+    mean, group = mean.repeat(20, 1), torch.arange(300).repeat(20)
     # All rows would make an error significant that so few do not show.
-    assert scored(twins.ranks, twins.estimates).dependence[0] < 0.01
-    assert twins.dependence[0] > 0.01
-    gaps = torch.cat([ranks, torch.full_like(ranks, torch.nan)])
-    found = scored(gaps, torch.cat([mean, mean])).dependence
-    assert found == scored(ranks, mean).dependence
-
-
-# What is printed ----------------------------------------------------------------------
+    assert scored(ranks, mean).dependence[0] < 0.01
+    assert scored(ranks, mean, group=group).dependence[0] > 0.01
 
 
 def test_an_evaluation_says_what_was_found() -> None:
     torch.manual_seed(3)
-    theta = gaussian.prior().sample((300,))
+    posterior, theta = gaussian.posterior(), gaussian.prior().sample((300,))
     x = gaussian.simulator(theta)
-    right = metrics.evaluate(gaussian.posterior(), theta, x, num_samples=200, seed=0)
-    text = str(right)
-    assert "Calibrated as far as 300 observations can tell" in text
-    assert "No sign that coverage depends on the estimate" in text
-    assert f"{right.lpp:.2f}" in text
-    assert f"{right.lpp_z:.2f}" in text
-    assert "density zero" not in text
+    right = metrics.evaluate(posterior, theta, x, num_samples=200, seed=0)
+    for text in (
+        "Calibrated as far as 300 observations can tell",
+        "No sign that coverage depends on the estimate",
+        f"{right.lpp:.2f}",
+        f"{right.lpp_z:.2f}",
+    ):
+        assert text in str(right)
     # With too large a gain, the posterior overestimates what is large.
-    posterior = gaussian.posterior()
     posterior.parameter_names = ("mass", "length")  # as stacks have
     wrong = metrics.evaluate(posterior, theta, 1.4 * x, num_samples=200, seed=0)
-    text = str(wrong)
-    assert "The posterior is over-confident: ACAUC +" in text
-    assert "mass alone is over-confident" in text
-    assert "The coverage of length depends on its estimate (p = 0.001)" in text
-    assert f"90% intervals {wrong.coverage[89].mean():.0%}" in text
-    assert "Too few observations" in str(scored(RANKS[:4]))
+    assert "The posterior is over-confident: ACAUC +" in str(wrong)
+    assert "mass alone is over-confident" in str(wrong)
+    assert f"90% intervals {wrong.coverage[89].mean():.0%}" in str(wrong)
+    assert "Too few known parameters" in str(scored(RANKS[:4]))
+    narrow = (1 + torch.linspace(0, 1, 60).square()) / 2
+    assert "The posterior is too wide: ACAUC -" in str(scored(narrow[:, None]))
 
 
 def test_a_seed_fixes_the_samples_and_leaves_the_global_random_state_alone() -> None:
-    theta, x = gaussian_pairs(30)
-    state = torch.get_rng_state()
-    first = metrics.evaluate(GaussianPosterior(), theta, x, num_samples=20, seed=1)
-    assert torch.equal(torch.get_rng_state(), state)
-    torch.randn(7)
-    again = metrics.evaluate(GaussianPosterior(), theta, x, num_samples=20, seed=1)
-    other = metrics.evaluate(GaussianPosterior(), theta, x, num_samples=20, seed=2)
-    assert torch.equal(first.ranks, again.ranks)
-    assert not torch.equal(first.ranks, other.ranks)
-
-
-# Posteriors of sbi --------------------------------------------------------------------
+    theta, x = (one.repeat(2, 1) for one in gaussian_pairs(100))
+    found = []
+    for seed in (1, 1, 2):
+        state = torch.get_rng_state()
+        found.append(metrics.evaluate(GaussianPosterior(), theta, x, seed=seed))
+        assert torch.equal(torch.get_rng_state(), state)
+        torch.randn(7)
+    ranks, again, other = (one.ranks for one in found)
+    assert torch.equal(ranks, again)
+    assert not torch.equal(ranks, other)
+    # Equal observations in another chunk have other samples.
+    assert not torch.equal(ranks[:100], ranks[100:])
 
 
 def far_posterior() -> Any:
@@ -411,40 +321,20 @@ def test_log_probs_of_an_npe_are_those_of_its_network_inside_the_prior() -> None
     assert "100.0% of the true parameters have density zero" in str(moved)
 
 
-# Errors -------------------------------------------------------------------------------
-
-
-def test_an_evaluation_says_what_is_wrong_with_parameters_and_their_units() -> None:
-    theta, x = gaussian_pairs(12, d=2)
-    cases: list[tuple[dict[str, Any], str]] = [
-        ({"theta": theta[:, :0]}, "at least one number"),
-        ({"theta_std": torch.ones(3)}, "theta_std"),
-        ({"theta_std": torch.tensor([1.0, 0.0])}, "`theta_std` to be a number above 0"),
-        ({"num_samples": 19}, "`num_samples`"),
-    ]
-    good: dict[str, Any] = {"theta": theta, "x": x, "num_samples": 20}
-    for change, match in cases:
-        assert_refused(match, metrics.evaluate, GaussianPosterior(), **good | change)
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_nan_and_infinite_log_probs_raise_and_say_where(value: float) -> None:
-    class Broken(GaussianPosterior):
-        def log_prob_batched(self, theta: Tensor, x: Tensor) -> Tensor:
-            return torch.where(x[:, 0] == 107.0, value, x[:, 0]).unsqueeze(0)
-
-    x = torch.arange(120.0).unsqueeze(1)
-    with pytest.raises(InvalidInputError, match=r"first: \[107\]"):
-        metrics.evaluate(Broken(), x, x)
-
-
-@pytest.mark.parametrize("wrong", ["NaN", r"\(20, 12, 2\)"])
-def test_samples_that_are_nan_or_too_many_raise(wrong: str) -> None:
-    class Broken(GaussianPosterior):
-        def sample_batched(self, sample_shape: torch.Size, x: Tensor, **_: Any) -> Any:
-            rows = x.expand(*sample_shape, *x.shape)
-            return rows.log() if wrong == "NaN" else rows.repeat(1, 1, 2)
-
-    x = torch.arange(12.0).unsqueeze(1) - 1
-    with pytest.raises(InvalidInputError, match=wrong):
-        metrics.evaluate(Broken(), x, x, num_samples=20)
+@pytest.mark.parametrize(
+    ("method", "spoil", "match"),
+    [
+        ("log_prob_batched", lambda p: p * math.nan, "NaN or .Inf in 120 of 120 rows"),
+        ("log_prob_batched", lambda p: p + math.inf, "NaN or .Inf in 120 of 120 rows"),
+        ("sample_batched", lambda samples: samples * math.nan, "NaN"),
+        ("sample_batched", lambda samples: samples.repeat(1, 1, 2), r"\(20, 100, 2\)"),
+    ],
+)
+def test_a_posterior_that_returns_nan_or_a_wrong_shape_is_refused(
+    method: str, spoil: Any, match: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    posterior = GaussianPosterior()
+    right = getattr(posterior, method)
+    monkeypatch.setattr(posterior, method, lambda *a, **b: spoil(right(*a, **b)))
+    with pytest.raises(InvalidInputError, match=match):
+        metrics.evaluate(posterior, *gaussian_pairs(120), num_samples=20)
