@@ -88,7 +88,6 @@ def score_folds(
     are_plain = pairs.are_exact and bool((pairs.weight == 1).all())
     return StackingReport(
         names=tuple(candidate.name for candidate in candidates),
-        families=tuple(one.family or one.name for one in candidates),
         weights=stacking_weights(log_scores, pair_weights=weight),
         log_scores=log_scores,
         comparable_scores=(log_scores + weights[fold].log()).logsumexp(dim=1),
@@ -143,6 +142,4 @@ def _log_unit(data: StackData) -> float | Tensor:
     if data.pairs.are_drawn:
         return 0.0  # these scores are relative to the prior
     units = data.prior.log_units()
-    if data.pairs.are_exact:
-        return float(units.sum())
     return data.pairs.is_measured.to(units) @ units

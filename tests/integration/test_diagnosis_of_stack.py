@@ -77,7 +77,7 @@ def test_a_shift_is_an_alarm_where_the_stack_has_not_learned_it(
     rope: RoPE, stack: StackedPosterior
 ) -> None:
     assert alarms(look(rope, stack, centre=-0.5)) == SHIFTS | {UNLIKE}
-    other, names = copy.copy(stack), stack.report.names
-    for change in ({"keep_prior": names}, {"probability_of_prior": 0.3}):
+    other = copy.copy(stack)
+    for change in ({"keeps_prior": True}, {"probability_of_prior": 0.3}):
         other.report = replace(stack.report, **change)
         assert alarms(look(rope, other)) == SHIFTS
