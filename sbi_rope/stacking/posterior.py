@@ -32,8 +32,8 @@ class Versions:
         if len(flows) < len(densities):
             shares = [1 / len(densities)] * len(densities)
             return cls(Mixture(densities, shares), [*densities])
-        numbers = torch.arange(sum(one.num_members for one in flows))
-        parts = numbers.split([one.num_members for one in flows])
+        sizes = [one.num_members for one in flows]
+        parts = torch.arange(sum(sizes)).split(sizes)
         return cls(Flow.joined(flows), [part.tolist() for part in parts])
 
     def __getitem__(self, version: int) -> Density:

@@ -324,13 +324,10 @@ def _more_labels(report: StackingReport) -> Iterator[Line]:
     if (curve := report.learning_curve) is None:
         yield "Not tested: `stack(rope, learning_curve=True)` estimates it.", False
         return
-    first, *others = curve.scores
-    points = ", ".join(
-        f"{one.mean - first.mean:+.2f} nats with {n}"
-        for n, one in zip(curve.num_pairs[1:], others, strict=True)
-    )
-    start = f"Compared with training on {curve.num_pairs[0]} pairs"
-    yield f"{start}: {points or 'unknown'}.", False
+    (fewest, first), *others = zip(curve.num_pairs, curve.scores, strict=True)
+    points = [f"{one.mean - first.mean:+.2f} nats with {n}" for n, one in others]
+    text = f"Compared with training on {fewest} pairs: "
+    yield f"{text}{', '.join(points) or 'unknown'}.", False
     kind = "labels" if curve.evaluations[0].group is None else "groups"
     for more in dict.fromkeys((FEW_MORE, curve.num_labels)):
         gain = curve.gain(more)

@@ -109,7 +109,7 @@ def stack(
     else:
         chosen = _checked(candidates, data)
     batch = None if x_o is None else _compare_batch(data, x_o)
-    # Versions are trained on all folds but one, and for the curve on half and a quarter.
+    # Each version sees all folds but one, and for the curve half and a quarter of them.
     num_folds = len(data.folds)
     counts = [num_folds - 1]
     if learning_curve:
