@@ -8,7 +8,8 @@ from torch.distributions import Independent, Normal
 from sbi_rope import RoPE, stack
 from sbi_rope.data.simulate import Moments
 from sbi_rope.discrepancy.unlabelled import Marginal, fit_unlabelled
-from sbi_rope.stacking import UnlabelledCandidate, default_candidates
+from sbi_rope.stacking import default_candidates
+from sbi_rope.stacking.candidates import UnlabelledCandidate
 from sbi_rope.utils.errors import InvalidInputError
 from tests import gaussian
 from tests.stacks import NPE, PRIOR, observed, rope_of, stacked
