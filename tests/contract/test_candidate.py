@@ -73,9 +73,7 @@ def poisoned(data: StackData, rows: Tensor) -> StackData:
 def test_held_out_rows_change_nothing_that_scores_them(
     candidate: Candidate, noise: float, folds: tuple[int, ...]
 ) -> None:
-    theta, x = problem(16, seed=1)
-    rope = rope_of((theta[:0], x[:0])).append_calibration(theta, x, theta_std=noise)
-    data = data_of(rope)
+    data = data_of(rope := rope_of(problem(16, seed=1), theta_std=noise))
     for fold in folds:
         versions = [data.without(fold), data.without(fold, 2)][: len(folds)]
         before, after = (

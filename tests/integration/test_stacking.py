@@ -260,6 +260,9 @@ def test_densities_that_are_given_are_stacked_as_they_are() -> None:
         for parameter in another.posterior_estimator.parameters():
             parameter += 0.1
     assert torch.equal(unnormalised(posterior, theta, x), before)
+    wide = stacked(rope_of(), candidates=[Wide()])
+    drawn = wide.sample((2000,), x=x[0], reject_outside_prior=False, **QUIET)
+    assert float(drawn.std()) == pytest.approx(2.0, rel=0.1)
 
 
 def test_default_candidates_can_keep_the_prior() -> None:

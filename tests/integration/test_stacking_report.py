@@ -206,9 +206,8 @@ def test_a_report_names_pairs_whose_parameters_do_not_follow_the_prior() -> None
 def test_every_model_of_the_discrepancy_knows_the_specimens(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    theta, x = problem(16, seed=1)
-    rope, names = rope_of((theta[:0], x[:0])), [f"specimen {k % 8}" for k in range(16)]
-    rope.append_calibration(theta, x, theta_std=0.1, groups=names)
+    names = [f"specimen {k % 8}" for k in range(16)]
+    rope = rope_of(problem(16, seed=1), theta_std=0.1, groups=names)
     seen: list[Any] = []
     fit = DiscrepancyModel.fit
 
@@ -222,7 +221,7 @@ def test_every_model_of_the_discrepancy_knows_the_specimens(
         assert "16 calibration pairs in 8 groups" in str(data.discrepancy())
         data.targets(torch.arange(16))
     rope.train(seed=0, **QUIET)
-    assert seen == [[*range(8)] * 2] * (x.shape[1] + 2)
+    assert seen == [[*range(8)] * 2] * (3 + 2)
 
 
 @pytest.mark.medium
@@ -232,7 +231,7 @@ def test_recordings_of_a_specimen_count_once_whatever_their_labels_are() -> None
     x = problems.simulate(theta) + 0.4
 
     def report(labels: torch.Tensor, **options: Any) -> StackingReport:
-        rope = rope_of((theta[:0], x[:0])).append_calibration(labels, x, **options)
+        rope = rope_of((labels, x), **options)
         return stacked(rope, candidates=[PRIOR, NPE]).report
 
     # Equal exact labels are found without names.

@@ -41,19 +41,12 @@ def test_no_other_weights_are_better(n: int, num_candidates: int) -> None:
     assert torch.allclose(found.grad, found.grad.mean(), rtol=1e-4)
 
 
-def test_a_pair_that_counts_twice_is_as_good_as_two_pairs() -> None:
-    scores = random_scores(12, 4)
-    twice = stacking_weights(scores, pair_weights=torch.tensor([2.0] * 3 + [1.0] * 9))
-    repeated = stacking_weights(torch.cat([scores[:3], scores]))
-    assert torch.allclose(twice, repeated, atol=1e-6)
-    assert stacking_weights(scores[:0]).tolist() == [0.25] * 4
-
-
 def test_a_candidate_without_density_at_any_pair_has_only_its_pseudo_count() -> None:
     scores = random_scores(20, 3)
     scores[:, 1] = -torch.inf
     assert float(stacking_weights(scores)[1]) == pytest.approx((1 / 3) / 21)
     assert stacking_weights(scores[:, :1]).tolist() == [1.0]
+    assert stacking_weights(scores[:0]).tolist() == [1 / 3] * 3
 
 
 def test_neither_order_dtype_nor_a_constant_at_each_pair_changes_the_weights() -> None:
