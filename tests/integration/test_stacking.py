@@ -280,24 +280,13 @@ def test_what_cannot_be_stacked_is_refused_before_anything_is_trained(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(Box, "fit", None)
+    unfit, invalid = UnsupportedPosteriorError, InvalidInputError
     for bad, kind, match in (
-        (GivenCandidate(Wide(), "box"), InvalidInputError, "different names"),
-        (Flat(), InvalidInputError, r"log_prob\(theta, x\) of shape \(1, 2\)"),
-        (
-            problems.vector_field_posterior("fmpe"),
-            UnsupportedPosteriorError,
-            "with a density",
-        ),
-        (
-            problems.npe_posterior("mdn", dim=1),
-            UnsupportedPosteriorError,
-            r"\(\(3,\), \(2,\)\)",
-        ),
-        (
-            trained().build_posterior(observed(), seed=0),
-            InvalidInputError,
-            "of the batch",
-        ),
+        (GivenCandidate(Wide(), "box"), invalid, "different names"),
+        (Flat(), invalid, r"log_prob\(theta, x\) of shape \(1, 2\)"),
+        (problems.vector_field_posterior("fmpe"), unfit, "with a density"),
+        (problems.npe_posterior("mdn", dim=1), unfit, r"\(\(3,\), \(2,\)\)"),
+        (trained().build_posterior(observed(), seed=0), invalid, "of the batch"),
     ):
         with pytest.raises(kind, match=match):
             stacked(rope_of(), candidates=[BOX, bad])

@@ -82,9 +82,6 @@ def flat(report: StackingReport) -> str:
     return " ".join(str(report).split())
 
 
-# Scores and weights -------------------------------------------------------------------
-
-
 def test_gains_are_mean_differences_of_comparable_scores() -> None:
     report = made_up(leak=0.2)
     # The prior has no mass outside itself, and is compared with what is deployed.
@@ -150,9 +147,6 @@ def test_weights_are_listed_and_those_of_the_prior_are_alarming() -> None:
     assert advice in flat(made_up(weights=[0.7, 0.1, 0.1, 0.1]))
 
 
-# Calibration --------------------------------------------------------------------------
-
-
 def test_the_text_says_what_to_do_about_over_confidence() -> None:
     narrow = (1 + torch.rand(400, 2).sqrt()) / 2
     assert "Collect more labels" in flat(made_up(n=400, ranks=narrow))
@@ -199,9 +193,6 @@ def test_a_report_names_pairs_whose_parameters_do_not_follow_the_prior() -> None
     assert "not distributed like the prior" not in flat(the_stack().report)
 
 
-# Groups -------------------------------------------------------------------------------
-
-
 @pytest.mark.medium
 def test_every_model_of_the_discrepancy_knows_the_specimens(
     monkeypatch: pytest.MonkeyPatch,
@@ -246,9 +237,6 @@ def test_recordings_of_a_specimen_count_once_whatever_their_labels_are() -> None
     assert together.held_out.num_independent == pytest.approx(12)
     assert all(len(together.fold[specimen == k].unique()) == 1 for k in range(12))
     assert report(noisy, theta_std=0.01).held_out.num_independent == 24
-
-
-# Learning curves ----------------------------------------------------------------------
 
 
 @pytest.mark.medium
@@ -301,9 +289,6 @@ def test_the_gain_of_more_labels_is_extrapolated_from_the_curve() -> None:
     assert math.isnan(curve_of({5: slopes}).gain(10).mean)
 
 
-# Pictures, calls, names -------------------------------------------------------------
-
-
 def test_a_score_far_below_the_others_is_an_arrow_with_its_number() -> None:
     for npe, text in ((-382.0, "-382"), (-math.inf, "zero density")):
         scores = plots.stacking_report(made_up(npe=npe)).axes[0]
@@ -336,9 +321,6 @@ def test_names_of_parameters_are_given_once() -> None:
     assert held_out.names == found.parameter_names == ("slope", "size")
     with pytest.raises(InvalidInputError, match="2 different names"):
         rope_of(parameter_names=("a", "a"))
-
-
-# The page -----------------------------------------------------------------------------
 
 
 def written(report: StackingReport, folder: Path, **options: Any) -> str:

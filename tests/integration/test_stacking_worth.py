@@ -72,9 +72,8 @@ def test_shuffled_labels_make_a_stack_almost_the_prior() -> None:
     theta_o, x_o = labelled(300, gaussian.real_process)
     theta, x = labelled(50, gaussian.real_process)
     posterior = gaussian_stack(theta.roll(1, dims=0), x)
-    at_prior = float(gaussian.prior().log_prob(theta_o).mean())
-    lost = at_prior - float(score_of(posterior, theta_o, x_o).mean())
-    assert lost < 0.1
+    at_prior = gaussian.prior().log_prob(theta_o)
+    assert float((at_prior - score_of(posterior, theta_o, x_o)).mean()) < 0.1
 
 
 def test_held_out_scores_promise_no_more_than_test_observations_give() -> None:
