@@ -32,7 +32,8 @@ from sbi_rope.density import MixturePosterior
 from sbi_rope.methods import DiscrepancyNPE
 from sbi_rope.methods.discrepancy_npe import Corrected
 from sbi_rope.rope import RoPE
-from sbi_rope.stacking import DiscrepancyCandidate, StackData
+from sbi_rope.stacking import StackData
+from sbi_rope.stacking.candidates import DiscrepancyCandidate
 from sbi_rope.training.fit import History
 
 # Tasks whose observations are statistics: NNPE's noise is on them, not on h(x).

@@ -162,8 +162,12 @@ def _beside_candidates(case: Case, posterior: StackedPosterior) -> dict[str, flo
     unit = float(case.task.prior_std.log().sum())
     report = posterior.report
     held_out = report.held_out.log_prob
-    lpp = posterior.candidate_log_probs(*case.test_set).mean(dim=0) + unit
-    of_each = dict(zip(report.names, lpp.tolist(), strict=True))
+    device = posterior.posterior_estimator.device
+    theta, x = (one.to(device) for one in case.test_set)
+    of_each = {
+        name: float(one.average.log_prob(theta[None], x).double().mean()) + unit
+        for name, one in zip(report.names, posterior.versions, strict=True)
+    }
     basics = [of_each[name] for name in ("prior", "NPE") if name in of_each]
     return {
         "held_out": float(held_out.mean()) + unit,

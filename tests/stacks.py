@@ -15,14 +15,8 @@ from sbi_rope.density import Density, Prior
 from sbi_rope.discrepancy import DiscrepancyModel
 from sbi_rope.discrepancy.correction import TRAINING
 from sbi_rope.rope.finetuning import FINETUNING
-from sbi_rope.stacking import (
-    Candidate,
-    StackData,
-    StackingReport,
-    default_candidates,
-    stack,
-)
-from sbi_rope.stacking.candidates import REHEARSED
+from sbi_rope.stacking import Candidate, StackData, StackingReport, stack
+from sbi_rope.stacking.candidates import REHEARSED, default_candidates
 from sbi_rope.training.fit import Training
 from tests import problems
 
@@ -110,19 +104,17 @@ def rope_of(
     *,
     family: str = "mdn",
     embedding: str = "linear",
-    weights: Tensor | None = None,
-    groups: Any = None,
     **options: Any,
 ) -> RoPE:
     """Return a RoPE that is not trained, because a stack does not need that."""
+    names = {"theta_std", "weights", "groups"} & {*options}
+    of_labels = {name: options.pop(name) for name in names}
     if "simulations" not in options:
         options.setdefault("simulator", uneven)
     options.setdefault("finetuner", QUICK)
     rope = RoPE(problems.npe_posterior(family, embedding), **options)
-    theta, x = problem(NUM_PAIRS, seed=1) if pairs is None else pairs
-    if not len(theta):
-        return rope
-    return rope.append_calibration(theta, x, weights=weights, groups=groups)
+    pairs = problem(NUM_PAIRS, seed=1) if pairs is None else pairs
+    return rope.append_calibration(*pairs, **of_labels)
 
 
 def trained() -> RoPE:
@@ -155,10 +147,7 @@ def the_stack() -> StackedPosterior:
 
 @functools.cache
 def small_stack() -> StackedPosterior:
-    """Return a stack of three candidates, the last of which depends on the pairs.
-
-    Tests share it and must not change it.
-    """
+    """Return a stack of three candidates, as shared; the last depends on the pairs."""
     with torch.random.fork_rng():
         return stacked(rope_of(), candidates=[PRIOR, NPE, BOX], num_folds=5)
 

@@ -154,8 +154,7 @@ def _learned(
     report = getattr(posterior, "report", None)
     if report is None or test is None or test.is_different:
         return []
-    keeps_prior = len(report.keep_prior) == len(report.names)
-    if keeps_prior or not is_improbable(report.probability_of_prior):
+    if report.keeps_prior or not is_improbable(report.probability_of_prior):
         return []
     each = zip(names, test.p_values, strict=True)
     return [name for name, p_value in each if p_value > NO_SIGN]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from sbi_rope.diagnosis import Diagnosis
 from sbi_rope.plots import discrepancy, implied_parameters, stacking_report
 from sbi_rope.stacking import StackingReport
-from sbi_rope.stacking.report import METHODS, headline, sections_of
+from sbi_rope.stacking.report import headline, sections_of
 from sbi_rope.utils.settings import check
 
 if TYPE_CHECKING:
@@ -84,11 +84,10 @@ def write_html(
 def _parts(report: StackingReport) -> list[_Part]:
     """Return the sections of the printed report, with their tables and pictures."""
     parts = helped, _, simulator, _ = [_Part(*one) for one in sections_of(report)]
-    helped.heads = "candidate", "method", "weight", "nats a pair", "in prior units"
+    helped.heads = "candidate", "weight", "nats a pair", "in prior units"
     helped.rows = [
         (
             str(row["candidate"]),
-            METHODS.get(row["family"], str(row["family"])),
             f"{row['weight']:.0%}",
             f"{row['score']:.2f} ({row['score_low']:.2f} to {row['score_high']:.2f})",
             f"{row['score_z']:.2f}",

@@ -2,12 +2,7 @@
 
 from sbi_rope.stacking.candidates import (
     Candidate,
-    DiscrepancyCandidate,
-    FinetunedCandidate,
     GivenCandidate,
-    NPECandidate,
-    PriorCandidate,
-    UnlabelledCandidate,
     default_candidates,
 )
 from sbi_rope.stacking.data import StackData
@@ -18,16 +13,11 @@ from sbi_rope.stacking.weights import stacking_weights
 
 __all__ = [
     "Candidate",
-    "DiscrepancyCandidate",
-    "FinetunedCandidate",
     "GivenCandidate",
     "LearningCurve",
-    "NPECandidate",
-    "PriorCandidate",
     "StackData",
     "StackedPosterior",
     "StackingReport",
-    "UnlabelledCandidate",
     "default_candidates",
     "stack",
     "stacking_weights",

@@ -35,20 +35,19 @@ from sbi_rope.utils.errors import UnsupportedPosteriorError
 from sbi_rope.utils.settings import check
 from sbi_rope.utils.tensors import as_batch, as_numbers
 
+Parts = Sequence[tuple[Tensor, Tensor]]  # the rows to train on, and those held out
+
 
 class Candidate(ABC):
     """A candidate of a stack, in ten lines: give it a name and define :meth:`fit`.
 
     Attributes:
         name: Its name in the report.
-        family: The name of its method, by which weights are added up in the report;
-            that of the candidate if it has none.
         learns_prior: Whether it learns from the pairs how parameters are distributed,
             as all training on them does.
     """
 
     name: str
-    family: str = ""
     learns_prior: bool = True
 
     def suits(self, data: StackData) -> bool:
@@ -115,39 +114,33 @@ def as_density(own: Any, data: StackData, name: str) -> Density:
     """Return a posterior as a density of the shapes of the pairs."""
     theta, x = data.pairs.mean, data.pairs.x
     if isinstance(own, NeuralPosterior):
-        if not getattr(own, "is_amortised", True):
-            raise UnsupportedPosteriorError(
-                f"Expected the candidate {name!r} to answer any x; got a posterior "
-                "that belongs to a batch."
-            )
         own = density_of(own, what=f"the candidate {name!r}")
     if not isinstance(own, Density):
         raise UnsupportedPosteriorError(
             f"Expected the candidate {name!r} to be a posterior or a "
             f"`sbi_rope.density.Density`; got {type(own).__name__}."
         )
-    shapes = own.condition_shape, own.input_shape
-    if shapes != (x.shape[1:], theta.shape[1:]):
+    shapes = tuple(own.condition_shape), tuple(own.input_shape)
+    if shapes != (expected := (tuple(x.shape[1:]), tuple(theta.shape[1:]))):
         raise UnsupportedPosteriorError(
-            f"Expected the candidate {name!r} to map x {tuple(x.shape[1:])} to theta "
-            f"{tuple(theta.shape[1:])}; got x {tuple(shapes[0])} and theta "
-            f"{tuple(shapes[1])}."
+            f"Expected the candidate {name!r} to have shapes of x and theta "
+            f"{expected}; got {shapes}."
         )
+    own.embed(x[:2])  # raises if it belongs to the observations of a batch
     return own
 
 
 # NPE of corrected simulations ---------------------------------------------------------
 
 
-def name_of(space: Space) -> str:
-    """Return what a correction is called."""
-    return "discrepancy" if space == "embedding" else f"discrepancy ({space})"
-
-
 class CorrectingCandidate(Candidate):
     """A candidate that corrects simulations; ``space`` says what, None nothing."""
 
     space: Space | None
+
+    def name_of_space(self) -> str:
+        """Return what the correction is called."""
+        return "discrepancy" + f" ({self.space})" * (self.space != "embedding")
 
     def suits(self, data: StackData) -> bool:
         """Tell whether what it corrects is short, and what only nets help is long."""
@@ -161,35 +154,23 @@ class CorrectingCandidate(Candidate):
 
 
 class DiscrepancyCandidate(CorrectingCandidate):
-    """NPE trained on corrected simulations, as learned from the pairs.
+    """NPE trained on simulations that are corrected as learned from the pairs.
 
-    See :class:`~sbi_rope.discrepancy.DiscrepancyNPE`.
-
-    Args:
-        space: What is corrected: the embedding h(x), the input x, or the embedding
-            by tuned nets.
-        learn_prior: Whether the distribution of parameters is learned from the pairs.
+    See :class:`~sbi_rope.discrepancy.DiscrepancyNPE`. Corrected is the embedding h(x),
+    the input x, or the embedding by tuned nets.
     """
 
-    family = "discrepancy"
-
-    def __init__(self, *, space: Space = "embedding", learn_prior: bool = True) -> None:
-        check("space", space, Space)
-        check("learn_prior", learn_prior, bool)
+    def __init__(self, space: Space = "embedding", *, learn_prior: bool = True) -> None:
         self.space, self.learns_prior = space, learn_prior
-        self.name = name_of(space) + ("" if learn_prior else ", given prior")
+        self.name = self.name_of_space() + ("" if learn_prior else ", given prior")
 
     def fit(self, data: StackData, versions: Sequence[Tensor]) -> list[Density]:
         """Train NPE on corrected simulations."""
-        flow, members = started(
-            data, versions, self.space, learn_prior=self.learns_prior
-        )
+        learned = {"learn_prior": self.learns_prior}
+        flow, members = started(data, versions, self.space, **learned)
         # Other spaces have the same flow for all parts of a version.
         several = None if self.space == "tuned" else 1
         return [flow[numbers[:several]] for numbers in members]
-
-
-Parts = Sequence[tuple[Tensor, Tensor]]
 
 
 def started(
@@ -291,29 +272,20 @@ REHEARSED, MIN_TO_REHEARSE = replace(FINETUNING, stop_after_epochs=10), 100
 
 
 class FinetunedCandidate(CorrectingCandidate):
-    r"""NPE, unchanged or corrected, whose parameters are then trained on the pairs.
+    """NPE, corrected in a space or not, whose parameters are then trained on the pairs.
 
     It is the average of several nets. Each of them holds out another part of the
     pairs, to know when to stop training. Behind a corrected embedding h(x) only the
-    density is trained.
-
-    Args:
-        space: What is corrected in the NPE that it starts from; nothing if None.
-        rehearse: Whether to train on simulations, too, as
-            :class:`~sbi_rope.baselines.JointNPE` does from scratch. It is for images,
-            series and sets of trials, where the embedding net has to learn what
-            simulations do not show. A version then holds out a single part.
+    density is trained. With ``rehearse`` it is trained on simulations, too, as
+    :class:`~sbi_rope.baselines.JointNPE` is from scratch, and a version holds out a
+    single part. This is for images, series and sets of trials, where the embedding net
+    has to learn what simulations do not show.
     """
 
-    def __init__(self, *, space: Space | None = None, rehearse: bool = False) -> None:
-        check("space", space, Space | None)
-        check("rehearse", rehearse, bool)
+    def __init__(self, space: Space | None = None, *, rehearse: bool = False) -> None:
         self.space, self.rehearse = space, rehearse
-        self.name = self.family = "fine-tuned NPE"
-        if space is not None:
-            self.family = "discrepancy, fine-tuned"
-            self.name = f"{name_of(space)}, fine-tuned"
-        self.name += ", rehearsed" if rehearse else ""
+        self.name = f"{self.name_of_space()}, fine-tuned" if space else "fine-tuned NPE"
+        self.name += ", rehearsed" * rehearse
 
     def suits(self, data: StackData) -> bool:
         """Tell whether there are parts to hold out, and the starting NPE applies."""
@@ -368,12 +340,8 @@ class UnlabelledCandidate(Candidate):
     """NPE trained on corrected simulations, as learned from unlabelled x, too.
 
     It assumes that the parameters of the observations follow the prior, see
-    ``sbi_rope.discrepancy.unlabelled``. The labels decide about its weight.
-
-    Args:
-        x_o: Real observations, shape ``(n_o, l)``, of which up to 200 are used. Those
-            of the calibration pairs should not be among them, so that the scores are
-            those of new observations. The stack may be asked about others, too.
+    ``sbi_rope.discrepancy.unlabelled``. The labels decide about its weight. Those of
+    the pairs should not be among ``x_o`` ``(n_o, l)``, of which up to 200 are used.
     """
 
     name = "discrepancy, with x_o"
@@ -427,15 +395,10 @@ MIN_TO_REGRESS = 10
 
 
 class RegressionCandidate(Candidate):
-    """A Gaussian process of the labels, which needs no simulator.
+    """A Gaussian process from x, or from h(x), which needs no simulator.
 
     See :class:`~sbi_rope.density.GaussianProcess`.
-
-    Args:
-        embeds: Whether it depends on the embedding h(x), or on x itself.
     """
-
-    family = "regression"
 
     def __init__(self, *, embeds: bool = False) -> None:
         self.embeds = embeds
@@ -503,8 +466,8 @@ def default_candidates(
         PriorCandidate(),
         NPECandidate(),
         FinetunedCandidate(),
-        *(DiscrepancyCandidate(space=one, learn_prior=learn_prior) for one in spaces),
-        *(FinetunedCandidate(space=one) for one in spaces),
+        *(DiscrepancyCandidate(one, learn_prior=learn_prior) for one in spaces),
+        *(FinetunedCandidate(one) for one in spaces),
         FinetunedCandidate(rehearse=True),
         RegressionCandidate(),
         RegressionCandidate(embeds=True),

@@ -45,12 +45,6 @@ class StackData:
     What is drawn for some rows has a seed that follows from these rows, and no line
     depends on what was asked for before. What candidates share is ``kept``, by keys
     that say what it depends on.
-
-    Args:
-        rope: RoPE with all calibration pairs, of at least two groups.
-        num_folds: Number of folds. There are at most as many as groups of pairs.
-        seed: Seed of everything random.
-        show_progress_bars: Whether to show the progress of trainings and simulations.
     """
 
     def __init__(
@@ -82,8 +76,7 @@ class StackData:
     def without(self, fold: int, num_folds: int | None = None) -> Tensor:
         """Return the rows of the folds that follow one; of all others if None."""
         count = len(self.folds)
-        num_folds = count - 1 if num_folds is None else num_folds
-        used = sorted((fold + 1 + j) % count for j in range(num_folds))
+        used = sorted((fold + 1 + j) % count for j in range(num_folds or count - 1))
         return torch.cat([self.folds[number] for number in used])
 
     def holdouts(self, rows: Tensor) -> list[tuple[Tensor, Tensor]]:

@@ -11,17 +11,13 @@ from sbi_rope.density import Density, Flow, Mixture, MixturePosterior
 from sbi_rope.density.sets import SetScores
 from sbi_rope.stacking.report import StackingReport
 from sbi_rope.utils.errors import InvalidInputError
-from sbi_rope.utils.tensors import as_batch
 
 
 @dataclass(frozen=True, eq=False)
 class Versions:
-    """The densities of a candidate, one for each version, and their average.
+    """The average of a candidate's versions, and each version by itself.
 
-    Attributes:
-        average: The average of all versions with equal weights. Flows are averaged in
-            one network, from which the flows of each version can be taken out.
-        parts: Each version: a density, or the numbers of its flows in the average.
+    Flows are averaged in one network; a version is then the numbers of its flows.
     """
 
     average: Density
@@ -36,8 +32,8 @@ class Versions:
         if len(flows) < len(densities):
             shares = [1 / len(densities)] * len(densities)
             return cls(Mixture(densities, shares), [*densities])
-        numbers = torch.arange(sum(one.num_members for one in flows))
-        parts = numbers.split([one.num_members for one in flows])
+        sizes = [one.num_members for one in flows]
+        parts = torch.arange(sum(sizes)).split(sizes)
         return cls(Flow.joined(flows), [part.tolist() for part in parts])
 
     def __getitem__(self, version: int) -> Density:
@@ -103,26 +99,6 @@ class StackedPosterior(MixturePosterior):
     def candidate_weights(self) -> dict[str, float]:
         """The weight of each candidate, by name. The weights sum to one."""
         return dict(zip(self.report.names, self.report.weights.tolist(), strict=True))
-
-    @torch.no_grad()
-    def candidate_log_probs(self, theta: Tensor, x: Tensor) -> Tensor:
-        """Return the log density of each candidate by itself at pairs.
-
-        Each density is the average of the versions, not corrected for leakage.
-
-        Args:
-            theta: Parameters, shape ``(n, d)``.
-            x: Their observations, shape ``(n, *event)``.
-
-        Returns:
-            Shape ``(n, K)``, float64, in the order of ``candidate_weights``.
-        """
-        x = self._batch_of_x(x)
-        shape, names = self.posterior_estimator.input_shape, self.parameter_names
-        theta = as_batch("theta", theta, shape, rows=len(x), names=names)
-        x = x.to(self.posterior_estimator.device)
-        log_probs = [one.average.log_prob(theta[None], x)[0] for one in self.versions]
-        return torch.stack(log_probs, dim=1).double()
 
     def _held_out(self) -> tuple[SetScores, list[MixturePosterior]]:
         if (scores := self.report.set_scores) is None:

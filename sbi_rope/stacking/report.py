@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from sbi_rope.data.parameters import is_improbable
-from sbi_rope.density.sets import SetScores, rank_needed
+from sbi_rope.density.sets import SetScores
 from sbi_rope.discrepancy import DiscrepancyReport
 from sbi_rope.metrics import Evaluation
 from sbi_rope.metrics.evaluation import FEWEST, LEVEL
@@ -19,24 +19,10 @@ from sbi_rope.utils.settings import Count, check
 
 # How many more labels the learning curve is read for; and twice as many as there are.
 FEW_MORE = 10
-# A difference of less than this, in nats a pair, is slight: 10 % of the density. With
-# one of so many, a network is far from anything that it has seen.
-SLIGHT, INCOMPARABLE = 0.1, 1e6
 # Smaller weights, and more entries of x, are not listed in the text.
-SMALL_WEIGHT, MAX_ENTRIES = 0.005, 5
+SMALL_WEIGHT, MAX_ENTRIES = 0.015, 5
 
 REFERENCES = {"prior": "the prior", "NPE": "NPE as it was"}
-METHODS = {
-    "prior": "the prior, which learns nothing from x",
-    "NPE": "NPE as it was trained on simulations",
-    "fine-tuned NPE": "NPE, trained further on the labels",
-    "discrepancy": "NPE of simulations that a linear model of the discrepancy corrects",
-    "discrepancy, fine-tuned": "NPE of corrected simulations, trained further on the "
-    "labels",
-    "regression": "the labels alone, without the simulator",
-    "discrepancy, with x_o": "NPE of simulations that a linear model corrects, learned "
-    "from observations without labels, too",
-}
 # A sentence, and whether it is alarming.
 Line = tuple[str, bool]
 
@@ -113,7 +99,6 @@ class StackingReport:
 
     Attributes:
         names: The names of the K candidates.
-        families: The method of each candidate.
         weights: The weights of the candidates, fitted to all pairs, shape ``(K,)``.
         log_scores: The log density of the true parameters under each candidate, shape
             ``(n, K)``, not corrected for mass outside the prior.
@@ -133,14 +118,12 @@ class StackingReport:
             a discrepancy, or x is not a short vector.
         probability_of_prior: The probability that the parameters of the pairs were
             drawn from the prior, see :func:`~sbi_rope.discrepancy.learn_parameters`.
-        keep_prior: The names of the candidates that do not learn from the pairs how
-            parameters are distributed.
-        provenance: How it was made, in words: seed, seconds, simulator calls, and the
-            default candidates that the data do not allow.
+        keeps_prior: Whether no candidate learns from the pairs how parameters are
+            distributed.
+        provenance: How it was made, in words: seed, seconds, simulator calls.
     """
 
     names: tuple[str, ...]
-    families: tuple[str, ...]
     weights: Tensor
     log_scores: Tensor = field(repr=False)
     comparable_scores: Tensor = field(repr=False)
@@ -153,7 +136,7 @@ class StackingReport:
     batch: TwoSampleTest | None = None
     discrepancy: DiscrepancyReport | None = None
     probability_of_prior: float | None = None
-    keep_prior: tuple[str, ...] = ()
+    keeps_prior: bool = False
     provenance: dict[str, str] = field(default_factory=dict, repr=False)
 
     @property
@@ -181,14 +164,11 @@ class StackingReport:
         standard deviations of the prior.
         """
         rows, held_out = [], self.held_out
-        names = zip(self.names, self.families, self.weights.tolist(), strict=True)
-        for (name, family, weight), scores in zip(
-            names, self.log_scores.unbind(dim=1), strict=True
-        ):
-            row = {"candidate": name, "family": family, "weight": weight}
-            one = held_out.mean(scores)
-            row |= {"score": one.mean, "score_low": one.low, "score_high": one.high}
-            row["score_z"] = held_out.mean(scores + held_out.log_unit).mean
+        columns = self.weights.tolist(), self.log_scores.unbind(dim=1)
+        for name, weight, scores in zip(self.names, *columns, strict=True):
+            one, in_z = held_out.mean(scores), held_out.mean(scores + held_out.log_unit)
+            row = {"candidate": name, "weight": weight, "score": one.mean}
+            row |= {"score_low": one.low, "score_high": one.high, "score_z": in_z.mean}
             rows.append(row)
         return sorted(rows, key=lambda row: -row["score"])
 
@@ -251,37 +231,22 @@ def _help(report: StackingReport) -> Iterator[Line]:
 
 def _compared(other: str, gain: Estimate) -> str:
     """Say how the stack compares with a reference, no more than the interval shows."""
-    if abs(gain.mean) >= INCOMPARABLE:
-        return f"{other} cannot be compared: its density there is arbitrary."
+    if not math.isfinite(gain.mean):
+        return f"{other} cannot be compared: it has no density at some labels."
+    start = f"{'Better' if gain.low > 0 else 'Worse'} than {other}"
     if gain.low <= 0 <= gain.high:
         start = f"Not shown to differ from {other}"
-    else:
-        kind = "better" if gain.low > 0 else "worse"
-        kind = f"slightly {kind}" if abs(gain.mean) < SLIGHT else kind
-        start = f"{kind.capitalize()} than {other}"
     return f"{start}: {gain:+.2f} nats a pair (95% interval)."
 
 
 def _weights(report: StackingReport) -> Line:
-    totals = dict.fromkeys(report.families, 0.0)
-    for family, weight in zip(report.families, report.weights.tolist(), strict=True):
-        totals[family] += weight
-    totals = dict(sorted(totals.items(), key=lambda item: -item[1]))
-    listed = []
-    for family, weight in totals.items():
-        count = report.families.count(family)
-        several = f" ({count} candidates)" if count > 1 else ""
-        if weight >= SMALL_WEIGHT:
-            listed.append(f"{family} {weight:.0%}{several}")
-    family, weight = next(iter(totals.items()))
-    if weight < 0.5:
-        return f"No method has half of the weight: {'; '.join(listed)}.", False
+    weights = dict(zip(report.names, report.weights.tolist(), strict=True))
+    ordered = sorted(weights.items(), key=lambda item: -item[1])
+    listed = [f"{name} {w:.0%}" for name, w in ordered if w >= SMALL_WEIGHT]
     text = f"Weights: {'; '.join(listed)}."
-    if family in METHODS:
-        text += f" Mostly {METHODS[family]}."
-    if family == "prior":
+    if is_prior := weights.get("prior", 0.0) > 0.5:
         text += " Check that rows of theta and x belong together."
-    return text, family == "prior"
+    return text, is_prior
 
 
 def _trust(report: StackingReport) -> Iterator[Line]:
@@ -296,18 +261,9 @@ def _trust(report: StackingReport) -> Iterator[Line]:
         yield advice, True
     if is_improbable(report.probability_of_prior):
         yield _prior(report), True
-    scores = report.set_scores
-    if scores is not None and rank_needed(LEVEL, len(scores)) <= len(scores):
-        needed = scores.level_needed(LEVEL)
-        size = f"as large as the posterior's own {needed:.0%} sets"
-        if needed > 0.995:
-            size = "larger than almost all draws"
-        text = (
-            f"{LEVEL:.0%} sets of all parameters together hold "
-            f"{scores.share_held(LEVEL):.0%} of the exact labels; with a guarantee "
-            f"(`guaranteed=True`) they are {size}."
-        )
-        yield text, False
+    if (scores := report.set_scores) is not None:
+        text = f"{LEVEL:.0%} sets of all parameters together hold "
+        yield f"{text}{scores.share_held(LEVEL):.0%} of the exact labels.", False
     yield _assumption(report.batch)
 
 
@@ -317,7 +273,7 @@ def _prior(report: StackingReport) -> str:
         "The labels are not distributed like the prior (probability that they are: "
         f"{report.probability_of_prior:.1g}). "
     )
-    if len(report.keep_prior) == len(report.names):
+    if report.keeps_prior:
         return f"{text}Scores and coverage hold for parameters like these."
     return (
         f"{text}The stack expects the same of new observations. For others use "
@@ -347,18 +303,12 @@ def _simulator(report: StackingReport) -> Iterator[Line]:
         )
         yield text, False
         return
-    off = [one for one in found.summaries if one.is_off]
-    if off:
-        worst = "; ".join(
-            f"{one.name} by {one.size.median:.2g} (shift {one.shift.median:.2g}, gain "
-            f"{one.gain.median:.2g})"
-            for one in off[:MAX_ENTRIES]
-        )
-        others = "; and others" if len(off) > MAX_ENTRIES else ""
+    if off := [one for one in found.summaries if one.is_off]:
+        sizes = [f"{one.name} by {one.size.median:.2g}" for one in off[:MAX_ENTRIES]]
         text = (
             f"{len(off)} of {len(found.summaries)} entries of x are off, in standard "
-            f"deviations of simulations: {worst}{others}. Print `report.discrepancy` "
-            "for intervals."
+            f"deviations of simulations: {'; '.join(sizes)}. Print "
+            "`report.discrepancy` for shifts, gains and intervals."
         )
         yield text, True
     else:
@@ -371,13 +321,10 @@ def _more_labels(report: StackingReport) -> Iterator[Line]:
     if (curve := report.learning_curve) is None:
         yield "Not tested: `stack(rope, learning_curve=True)` estimates it.", False
         return
-    first, *others = curve.scores
-    points = ", ".join(
-        f"{one.mean - first.mean:+.2f} nats with {n}"
-        for n, one in zip(curve.num_pairs[1:], others, strict=True)
-    )
-    start = f"Compared with training on {curve.num_pairs[0]} pairs"
-    yield f"{start}: {points or 'unknown'}.", False
+    (fewest, first), *others = zip(curve.num_pairs, curve.scores, strict=True)
+    points = [f"{one.mean - first.mean:+.2f} nats with {n}" for n, one in others]
+    text = f"Compared with training on {fewest} pairs: "
+    yield f"{text}{', '.join(points) or 'unknown'}.", False
     kind = "labels" if curve.evaluations[0].group is None else "groups"
     for more in dict.fromkeys((FEW_MORE, curve.num_labels)):
         gain = curve.gain(more)

@@ -42,11 +42,11 @@ def score_folds(
         seed: Seed of the draws at the held-out pairs.
     """
     pairs, weight = data.pairs, data.pairs.shared_weight
-    folds = [(rows, [one[k] for one in fitted]) for k, rows in enumerate(data.folds)]
+    of_folds = [*zip(*(one[: len(data.folds)] for one in fitted), strict=True)]
     log_scores = weight.new_empty(len(data), len(fitted))
     fold = torch.empty_like(pairs.group)
     at_labels = []
-    for k, (rows, densities) in enumerate(folds):
+    for k, (rows, densities) in enumerate(zip(data.folds, of_folds, strict=True)):
         # Nodes come from the samples of each candidate, so that none is scored at
         # parameters that only others consider plausible.
         nodes, x = data.nodes(rows, densities, NUM_NODES), pairs.x[rows]
@@ -56,10 +56,9 @@ def score_folds(
         fold[rows], log_scores[rows] = k, nodes.log_mean(at_labels[k][1])
     weights = fold_weights(log_scores, fold, weight)
     parts = []
-    for (rows, densities), (nodes, log_q), own in zip(
-        folds, at_labels, weights, strict=True
-    ):
-        posterior, x = fold_posterior(densities, own, data.prior), pairs.x[rows]
+    for k, (rows, (nodes, log_q)) in enumerate(zip(data.folds, at_labels, strict=True)):
+        own, x = weights[k], pairs.x[rows]
+        posterior = fold_posterior(of_folds[k], own, data.prior)
         log_prob = nodes.log_mean((log_q + own.log()).logsumexp(dim=2))
         try:
             log_mass = posterior.leakage_correction(x).double().log()
@@ -88,7 +87,6 @@ def score_folds(
     are_plain = pairs.are_exact and bool((pairs.weight == 1).all())
     return StackingReport(
         names=tuple(candidate.name for candidate in candidates),
-        families=tuple(one.family or one.name for one in candidates),
         weights=stacking_weights(log_scores, pair_weights=weight),
         log_scores=log_scores,
         comparable_scores=(log_scores + weights[fold].log()).logsumexp(dim=1),
@@ -143,6 +141,4 @@ def _log_unit(data: StackData) -> float | Tensor:
     if data.pairs.are_drawn:
         return 0.0  # these scores are relative to the prior
     units = data.prior.log_units()
-    if data.pairs.are_exact:
-        return float(units.sum())
     return data.pairs.is_measured.to(units) @ units

@@ -29,9 +29,6 @@ from sbi_rope.utils.progress import is_shown
 from sbi_rope.utils.seeds import seeded
 from sbi_rope.utils.settings import Range, check
 
-# The learning curve trains on these shares of the folds, and on all folds but one.
-SMALLER = (0.25, 0.5)
-
 
 def stack(
     rope: RoPE,
@@ -104,42 +101,41 @@ def stack(
     )
     check_density(data.estimator, what="a RoPE of a posterior")
     if candidates is None:
-        known = default_candidates(x_o=x_o)
-        chosen = [one for one in known if one.suits(data)]
+        chosen = [one for one in default_candidates(x_o=x_o) if one.suits(data)]
     else:
-        known = chosen = _checked(candidates, data)
+        chosen = _checked(candidates, data)
     batch = None if x_o is None else _compare_batch(data, x_o)
-    # Versions are trained on all folds but one, and for the curve on fewer.
+    # Each version sees all folds but one, and for the curve half and a quarter of them.
     num_folds = len(data.folds)
-    smaller = {int(share * num_folds) for share in SMALLER if learning_curve}
-    counts = {num_folds - 1, *(n for n in smaller if 0 < n < num_folds - 1)}
-    points: dict[int, StackingReport] = {}
+    counts = [num_folds - 1]
+    if learning_curve:
+        counts += [n for n in (num_folds // 2, num_folds // 4) if 0 < n < counts[0]]
+    points: list[StackingReport] = []
     fitted: list[list[Density]] = []
-    for count in sorted(counts, reverse=True):
+    for count in counts:
         versions = [data.without(k, count) for k in range(num_folds)]
         if not fitted:
             versions.append(data.every)
         found = [_fitted(candidate, data, versions) for candidate in chosen]
         fitted = fitted or found
-        points[count] = score_folds(data, chosen, found, seed=of_scores)
+        points.append(score_folds(data, chosen, found, seed=of_scores))
     curve = LearningCurve(
-        num_pairs=tuple(len(data) * count // num_folds for count in sorted(counts)),
-        evaluations=tuple(points[count].held_out for count in sorted(counts)),
+        num_pairs=tuple(len(data) * count // num_folds for count in counts[::-1]),
+        evaluations=tuple(point.held_out for point in points[::-1]),
     )
-    corrects = any("discrepancy" in candidate.family for candidate in chosen)
+    corrects = any("discrepancy" in candidate.name for candidate in chosen)
     report = replace(
-        points[num_folds - 1],
+        points[0],
         learning_curve=curve if learning_curve else None,
         batch=batch,
         discrepancy=data.discrepancy() if corrects and data.compares_entries else None,
         probability_of_prior=probability_of_prior(
             data.pairs, data.prior, seed=data.seed
         ),
-        keep_prior=tuple(one.name for one in chosen if not one.learns_prior),
+        keeps_prior=not any(candidate.learns_prior for candidate in chosen),
         provenance={
-            "seed": "none, so that a repetition differs" if seed is None else str(seed),
+            "seed": str(seed),
             "seconds": f"{time.perf_counter() - start:.0f}",
-            "left out": "; ".join(c.name for c in known if c not in chosen) or "none",
             "simulator calls": f"{rope.source.num_calls - calls:,}",
         },
     )

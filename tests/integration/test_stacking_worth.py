@@ -39,38 +39,22 @@ def score_of(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
         return posterior.log_prob_batched(theta, x).double().flatten()
 
 
-def test_where_the_simulator_is_wrong_a_stack_is_better_than_npe_and_the_prior() -> (
-    None
-):
+def test_a_stack_beats_npe_and_prior_and_approaches_the_exact_posterior() -> None:
     theta_o, x_o = labelled(300, gaussian.real_process)
-    theta, x = labelled(50, gaussian.real_process)
-    posterior = gaussian_stack(theta, x)
-    found = float(score_of(posterior, theta_o, x_o).mean())
-    at_prior = float(gaussian.prior().log_prob(theta_o).mean())
-    npe = float(score_of(gaussian.posterior(), theta_o, x_o).mean())
-    exact = gaussian.exact_posterior(gaussian.undo(x_o)).log_prob(theta_o).mean()
-    assert found > max(at_prior, npe) + 0.5
-    assert found > float(exact) - 0.25
-    # And it says so.
-    for name in ("prior", "NPE"):
-        gain = posterior.report.gains.get(name)
-        assert gain is not None
-        assert gain.low > 0
-
-
-def test_with_more_pairs_a_stack_approaches_the_exact_posterior() -> None:
-    theta_o, x_o = labelled(300, gaussian.real_process)
+    at_prior = gaussian.prior().log_prob(theta_o).mean()
+    npe = score_of(gaussian.posterior(), theta_o, x_o).mean()
     exact = gaussian.exact_posterior(gaussian.undo(x_o)).log_prob(theta_o).mean()
     theta, x = labelled(200, gaussian.real_process)
-    few, many = (gaussian_stack(theta[:n], x[:n]) for n in (10, 200))
+    few, many = (gaussian_stack(theta[:n], x[:n]) for n in (50, 200))
     missing = [float(exact - score_of(one, theta_o, x_o).mean()) for one in (few, many)]
-    assert missing[0] > missing[1]
+    assert missing[0] < min(0.25, float(exact - max(at_prior, npe)) - 0.5)
     assert missing[1] < 0.1
+    # And it says so.
+    assert all(gain.low > 0 for gain in few.report.gains.values())
+    assert {*few.report.gains} == {"prior", "NPE"}
     levels = many.report.held_out.levels.double()
     # Calibrated levels are uniform. There are four standard errors on their mean.
     assert ((levels.mean(dim=0) - 0.5).abs() < 4 / (12 * 200) ** 0.5).all()
-    coverage = (levels < 0.9).double().mean(dim=0)
-    assert ((coverage - 0.9).abs() < 0.1).all()
 
 
 def test_where_the_simulator_is_right_a_stack_loses_less_than_a_twentieth_nat() -> None:
@@ -88,9 +72,8 @@ def test_shuffled_labels_make_a_stack_almost_the_prior() -> None:
     theta_o, x_o = labelled(300, gaussian.real_process)
     theta, x = labelled(50, gaussian.real_process)
     posterior = gaussian_stack(theta.roll(1, dims=0), x)
-    at_prior = float(gaussian.prior().log_prob(theta_o).mean())
-    lost = at_prior - float(score_of(posterior, theta_o, x_o).mean())
-    assert lost < 0.1
+    at_prior = gaussian.prior().log_prob(theta_o)
+    assert float((at_prior - score_of(posterior, theta_o, x_o)).mean()) < 0.1
 
 
 def test_held_out_scores_promise_no_more_than_test_observations_give() -> None:

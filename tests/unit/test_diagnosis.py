@@ -348,7 +348,7 @@ def test_a_shift_is_an_alarm_unless_a_stack_has_learned_it() -> None:
     other = drawn(60, seed=2, centre=-0.5)[1]
     assert alarms(look(rope, other, posterior=stack, **options)) == SHIFTS | {UNLIKE}
     report = stack.report
-    for change in ({"keep_prior": report.names}, {"probability_of_prior": 0.3}):
+    for change in ({"keeps_prior": True}, {"probability_of_prior": 0.3}):
         stack.report = replace(report, **change)
         assert alarms(look(rope, x_o, posterior=stack, **options)) == SHIFTS
 

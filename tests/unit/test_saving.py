@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from sbi_rope import load, save
 from sbi_rope.density import PriorPosterior
-from sbi_rope.stacking import DiscrepancyCandidate, FinetunedCandidate
+from sbi_rope.stacking.candidates import DiscrepancyCandidate, FinetunedCandidate
 from sbi_rope.tasks.distributions import UniformTriangle
 from sbi_rope.tasks.hemodynamics.prior import PopulationPrior
 from sbi_rope.utils.errors import DataNotFoundError, FileFormatError
