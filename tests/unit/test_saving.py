@@ -157,12 +157,12 @@ def test_calls_in_a_file_are_refused(value: Any, tmp_path: Path) -> None:
 
 def test_classes_of_the_user_have_to_be_trusted(tmp_path: Path) -> None:
     posterior: Any = PriorPosterior(problems.box(2))
-    posterior.net, posterior.function = problems.Filled(), problems.simulate
-    with pytest.raises(FileFormatError, match=r"trusted=\[Filled, simulate\]"):
+    posterior.net, posterior.function = problems.SmallCNN(), problems.simulate
+    with pytest.raises(FileFormatError, match=r"trusted=\[SmallCNN, simulate\]"):
         saved_and_loaded(posterior, tmp_path)
-    trusted = [problems.Filled, problems.simulate]
+    trusted = [problems.SmallCNN, problems.simulate]
     loaded = saved_and_loaded(posterior, tmp_path, trusted=trusted)
-    assert type(loaded.net) is problems.Filled
+    assert type(loaded.net) is problems.SmallCNN
     assert loaded.function is problems.simulate
 
 
