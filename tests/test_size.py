@@ -11,19 +11,25 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-# The most lines of all files of a kind in a folder, docstrings included.
+# The most lines of all files of a kind in folders, docstrings included. The core is the
+# package without its tasks and baselines.
 BUDGETS = {
-    "sbi_rope/*.py": 25_500,
-    "tests/*.py": 20_000,
-    "benchmarks/*.py": 4_000,
+    "core": 12_000,
+    "sbi_rope/baselines/*.py": 2_900,
+    "sbi_rope/tasks/*.py": 6_300,
+    "benchmarks/*.py": 2_900,
+    "tests/*.py": 14_500,
     "docs/*.md": 2_800,
 }
 # Checks live at the boundary: in settings, tensors, and where a posterior is split.
-MOST_CHECKS, CHECKS = 25, ("check", "warn", "refuse")
+MOST_CHECKS, CHECKS = 15, ("check", "warn", "refuse")
 
 
 def lines_of(place: str) -> int:
     """Count the lines of files, such as "docs/*.md", in a folder and all below it."""
+    if place == "core":
+        others = [one for one in BUDGETS if one.startswith("sbi_rope/")]
+        return lines_of("sbi_rope/*.py") - sum(map(lines_of, others))
     folder, pattern = place.rsplit("/", 1)
     files = (ROOT / folder).rglob(pattern)
     return sum(
@@ -54,13 +60,12 @@ def test_few_functions_check_and_warn() -> None:
 
 
 def main() -> None:
-    rooms = sorted(
-        p for p in (ROOT / "sbi_rope").iterdir() if (p / "__init__.py").exists()
-    )
-    for room in rooms:
-        print(f"{lines_of(f'sbi_rope/{room.name}/*.py'):7,}  sbi_rope/{room.name}")
+    for room in sorted((ROOT / "sbi_rope").iterdir()):
+        if (room / "__init__.py").exists():
+            print(f"{lines_of(f'sbi_rope/{room.name}/*.py'):7,}  sbi_rope/{room.name}")
     for place, budget in BUDGETS.items():
         print(f"{lines_of(place):7,}  {place} (at most {budget:,})")
+    print(f"{lines_of('sbi_rope/*.py'):7,}  sbi_rope/*.py")
     print(f"{len(checks()):7,}  functions that check or warn (at most {MOST_CHECKS})")
 
 

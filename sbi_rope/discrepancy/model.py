@@ -74,7 +74,7 @@ class DiscrepancyModel(Settings):
     The average contains the model :math:`z_i \mid \theta_i \sim \mathcal N(m_i, C)`, in
     which the simulator is right. If it is, the probability of this model goes to one
     with more pairs, and nothing is corrected, unless the noise of the simulator varies
-    by a factor of several with the parameters. :class:`DiscrepancyNPE` and stacks set
+    by a factor of several with the parameters. ``DiscrepancyNPE`` and stacks set
     the probability to zero if the pairs refute the simulator by themselves.
 
     All quantities are in standard deviations of simulations from the prior.

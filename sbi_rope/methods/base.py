@@ -78,7 +78,7 @@ class Method(ABC):
 
     Attributes:
         sees: The kinds of data that can be appended.
-        starts_from_npe: Whether it starts from NPE, see :meth:`from_posterior`.
+        starts_from_npe: Whether it starts from NPE, see ``from_posterior``.
         trains_on_statistics: Whether it trains on statistics of simulations, so that it
             needs simulations also beside a trained NPE.
         simulates: Whether it makes simulations of its own. Without a simulator it looks

@@ -31,7 +31,7 @@ class DiscrepancyNPE(Method):
     r"""NPE for real observations, with the discrepancy of the simulator integrated out.
 
     A Bayesian linear model of how real observations follow from simulations
-    (:class:`DiscrepancyModel`) is fitted to the calibration pairs. Simulations are then
+    (``DiscrepancyModel``) is fitted to the calibration pairs. Simulations are then
     corrected by draws from its posterior, and NPE is trained on them for some more
     seconds. The result is an ordinary amortised posterior for any observation.
 
@@ -51,7 +51,7 @@ class DiscrepancyNPE(Method):
         | https://doi.org/10.1111/1467-9868.00294
 
     Args:
-        prior, density_estimator, npe_training, simulator, device: See :class:`Method`.
+        prior, density_estimator, npe_training, simulator, device: See ``Method``.
         space: What is corrected, see above.
         learn_prior: Whether to learn the distribution of real parameters from those of
             the pairs, see :func:`~sbi_rope.discrepancy.learn_parameters`. Pass False

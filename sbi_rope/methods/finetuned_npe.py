@@ -40,8 +40,8 @@ class FinetunedNPE(Method):
     which is better than each of them, and better calibrated.
 
     Sees simulations and the calibration set. To be preferred from some 200 pairs on;
-    with 10 it can be worse than the prior. The posterior of :class:`DiscrepancyNPE` is
-    a better start than that of NPE: pass it to :meth:`from_posterior`.
+    with 10 it can be worse than the prior. The posterior of ``DiscrepancyNPE`` is
+    a better start than that of NPE: pass it to ``from_posterior``.
 
     References:
         | Multifidelity Simulation-based Inference for Computationally Expensive
@@ -49,7 +49,7 @@ class FinetunedNPE(Method):
         | https://arxiv.org/abs/2502.08416
 
     Args:
-        prior, density_estimator, npe_training, device: See :class:`Method`.
+        prior, density_estimator, npe_training, device: See ``Method``.
         num_holdouts: How often it is tuned. With one, ``validation_fraction`` of the
             pairs are held out. With K, the pairs are cut into K parts (at most as many
             as there are groups) and each is held out once. With fewer than five groups

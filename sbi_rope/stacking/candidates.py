@@ -156,7 +156,7 @@ class CorrectingCandidate(Candidate):
 class DiscrepancyCandidate(CorrectingCandidate):
     """NPE trained on simulations that are corrected as learned from the pairs.
 
-    See :class:`~sbi_rope.discrepancy.DiscrepancyNPE`. Corrected is the embedding h(x),
+    See :class:`~sbi_rope.methods.DiscrepancyNPE`. Corrected is the embedding h(x),
     the input x, or the embedding by tuned nets.
     """
 

@@ -87,6 +87,11 @@ def stacking_weights(
             break
         weights = weights * gradient
         weights = weights / weights.sum()
+    else:
+        warn_user(
+            f"The weights of the stack have not converged in {MAX_STEPS:,} steps. Leave "
+            "out candidates that are nearly the same."
+        )
     return weights
 
 
