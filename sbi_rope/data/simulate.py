@@ -113,15 +113,19 @@ class _Way:
         return x.reshape(expected).to(self.like, copy=True)
 
     def simulate(self, theta: Tensor, seed: int | None = None) -> Result:
-        """Simulate theta ``(n, d)``, as one batch or row by row."""
+        """Simulate theta ``(n, d)``; if a batch raises, its rows one by one."""
         x, error = self.like.new_full((len(theta), *self.like.shape[1:]), torch.nan), ""
-        rows: Any = [slice(None)] if self.batched else range(len(theta))
+        alone: Any = [slice(k, k + 1) if self.batched else k for k in range(len(theta))]
         with seeded(seed):
-            for row in rows:
-                try:
-                    x[row] = self.x_of(theta[row])
-                except Exception as raised:  # of any type
-                    error = error or repr(raised)
+            for rows in ([slice(None)], alone) if self.batched else (alone,):
+                error = ""
+                for row in rows:
+                    try:
+                        x[row] = self.x_of(theta[row])
+                    except Exception as raised:  # of any type
+                        error = error or repr(raised)
+                if not error:
+                    break
         return x, error
 
 

@@ -89,8 +89,8 @@ def stacking_weights(
         weights = weights / weights.sum()
     else:
         warn_user(
-            f"The weights of the stack have not converged in {MAX_STEPS:,} steps. Leave "
-            "out candidates that are nearly the same."
+            f"The weights have not converged in {MAX_STEPS:,} steps. Leave out "
+            "candidates that are nearly the same."
         )
     return weights
 
