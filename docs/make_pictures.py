@@ -127,7 +127,7 @@ def overview(rope: RoPE, npe: Any, theta: Tensor, x_o: Tensor) -> "Figure":
     posterior = rope.build_posterior(x_o, seed=0, **QUIET)
     with torch.no_grad():
         before, after = (
-            net(x_o) for net in (rope.embedding_net, rope.tuned_embedding_net)
+            net(x_o) for net in (rope.npe.h, rope.tuned_embedding_net)
         )
     draws = posterior[0].sample((2000,), **QUIET)[:, SHOWN]
     return plots.overview(

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import torch
@@ -57,16 +57,6 @@ COURSES = Courses(min_gain=0.01)
 IN_A_STACK = Courses(min_gain=0.01, min_fall=0.3, max_num=2)
 
 
-@dataclass(frozen=True, eq=False)
-class Correction:
-    """Copies of NPE that were trained on corrected simulations, and their losses."""
-
-    flow: Flow
-    # Replaces entries that do not vary in simulations, behind a net of real x.
-    constants: nn.Module
-    histories: list[History]
-
-
 def network_of(estimator: ConditionalEstimator, space: Space) -> nn.Module:
     """Return the map from x to its representation that is corrected."""
     net = embedding_of(estimator)
@@ -95,11 +85,6 @@ def fit_discrepancy(
     groups: Tensor | None = None,
 ) -> Discrepancy:
     """Fit the model to pairs, represented by z ``(n, l)``, in units of simulations."""
-    if not standardisation.varies.any():
-        raise InvalidInputError(
-            "Expected simulations that differ from each other; got the same embedding "
-            "(or the same x) for all of them."
-        )
     z, unit = standardisation(z.double()), in_units(moments, standardisation)
     # With few pairs and many entries, a right simulator that fits badly can have more
     # evidence than all discrepancies, each of which has many coefficients to learn.
@@ -132,6 +117,11 @@ def fit_version(
 def in_units(moments: Moments, standardisation: Standardisation) -> Moments:
     """Return moments of the entries that vary, in their standard deviations."""
     varies = standardisation.varies
+    if not varies.any():
+        raise InvalidInputError(
+            "Expected simulations that differ from each other; got the same embedding "
+            "(or the same x) for all of them."
+        )
     std = standardisation.std[varies]
     return Moments(
         means=standardisation(moments.means),
@@ -140,26 +130,20 @@ def in_units(moments: Moments, standardisation: Standardisation) -> Moments:
 
 
 def tuning_targets(
-    z: Tensor,
-    moments: Moments,
-    standardisation: Standardisation,
-    weights: Tensor | None = None,
-    groups: Tensor | None = None,
-    *,
-    seed: int | None = None,
+    pairs: Pairs, z: Tensor, moments: Moments, z_s: Tensor, *, seed: int | None = None
 ) -> Tensor:
     r"""Return the targets ``(n, l)`` of the tuning, :math:`E[h(S(\theta)) \mid y, x]`.
 
     A net that is tuned to averages given a partial label y alone would forget what x
     says about the other parameters. They are therefore also given x, under the
-    discrepancy model that is fitted to these pairs.
+    discrepancy model that is fitted to these pairs. There are embeddings z of the pairs
+    and z_s of simulations from the prior.
     """
-    model = DiscrepancyModel()
-    found = fit_discrepancy(z, moments, standardisation, model, weights, groups)
-    possible = standardisation(moments.means)
+    unit, model = Standardisation(z_s.double()), DiscrepancyModel()
+    found = fit_discrepancy(z, moments, unit, model, pairs.weight, pairs.group)
     with seeded(seed):
-        means = expected_means(found, standardisation(z.double()), possible)
-    return standardisation.undo(means).to(z)
+        means = expected_means(found, unit(z.double()), unit(moments.means))
+    return unit.undo(means).to(z)
 
 
 def surprise(
@@ -205,7 +189,7 @@ def correct_flow(
     num_steps: int | None = None,
     in_a_stack: bool = False,
     show_progress_bars: bool = False,
-) -> Correction:
+) -> tuple[Flow, nn.Module, list[History]]:
     r"""Train a copy of NPE for each version on corrected simulations, all at once.
 
     .. math::
@@ -218,13 +202,13 @@ def correct_flow(
     otherwise the density alone, for ``num_steps`` or in courses, which end earlier in a
     stack. With ``"tuned"`` the caller puts a tuned net and the constants in the place
     of h. Simulations are theta ``(n_s, d)`` from the prior and z ``(n_s, l)``.
+
+    Return the copies, a module that replaces entries which do not vary in simulations,
+    for behind a net of real x, and the losses of each copy.
     """
     theta, z = simulations
-    whole, training, unit = (
-        space == "input",
-        TRAINING[space],
-        Standardisation(z.double()),
-    )
+    whole, training = space == "input", TRAINING[space]
+    unit = Standardisation(z.double())
     z, count, net = unit(z.double()), len(versions), embedding_of(estimator)
     courses = Courses(math.inf) if num_steps else COURSES
     if in_a_stack:
@@ -278,7 +262,7 @@ def correct_flow(
         label="Correcting NPE",
         show_progress_bars=show_progress_bars,
     )
-    return Correction(flow, constants, histories)
+    return flow, constants, histories
 
 
 class SimulatedConstants(nn.Module):

@@ -1,6 +1,5 @@
 r"""A Bayesian linear model of how real observations differ from simulations."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,7 +12,6 @@ from torch import Tensor
 from sbi_rope.data.pairs import groups_of
 from sbi_rope.discrepancy.posterior import (
     Discrepancy,
-    Judged,
     Regressions,
     independent_pairs,
     log_density_of_right,
@@ -174,30 +172,29 @@ class DiscrepancyModel(Settings):
             shares = (torch.stack(evidence, dim=1) + log_prior).softmax(dim=1)
             return independent_pairs(groups, shares @ correlations, weights)
 
-        def posterior(mean: Tensor, weights: Tensor) -> tuple[Regressions, Judged]:
+        def posterior(mean: Tensor, weights: Tensor) -> tuple[Regressions, Tensor]:
+            """Return regressions, and the probability that the simulator is right."""
             found = judged = regress(mean, weights, precisions)
             if groups is not None:
                 # Whether the simulator is right is judged with each group as one pair.
                 # With a correlation that is too low, a right one would be refuted.
                 judged = regress(mean, once, precisions)
-            evidence = judged.log_evidence
-            off = evidence.logsumexp(dim=(1, 2)) - math.log(evidence[0].numel())
             right = log_density_of_right(z - mean, noise, once)
-            prior = torch.logit(off.new_tensor(self.probability_of_none))
-            return found, Judged(off, right, torch.sigmoid(right - off + prior))
+            prior = torch.logit(right.new_tensor(self.probability_of_none))
+            return found, torch.sigmoid(right - judged.mean_log_evidence() + prior)
 
         if possible and possible != (1,):
             with seeded(seed):
                 return impute(z, mean, posterior, counts)
         mean = mean.reshape(1, *z.shape)
-        found, judged = posterior(mean, counts(mean))
-        return found.posteriors(judged)[0]
+        found, none = posterior(mean, counts(mean))
+        return found.posteriors(none)[0]
 
 
 def impute(
     z: Tensor,
     possible: Tensor,
-    posterior: Callable[[Tensor, Tensor], tuple[Regressions, Judged]],
+    posterior: Callable[[Tensor, Tensor], tuple[Regressions, Tensor]],
     counts: Callable[[Tensor], Tensor],
 ) -> Discrepancy:
     r"""Average the posterior over imputed means, by Gibbs sampling in C chains.
@@ -209,10 +206,10 @@ def impute(
     """
     mean = possible.mean(dim=1).expand(NUM_CHAINS, -1, -1)
     weights = counts(mean)
-    found, judged = posterior(mean, weights)
+    found, none = posterior(mean, weights)
     kept: list[Discrepancy] = []
     for number in range(1, NUM_WARM_UP + NUM_KEPT * APART + 1):
-        probabilities = _probabilities(z, possible, *found.draw(judged))
+        probabilities = _probabilities(z, possible, *found.draw(none))
         # Faster than torch.multinomial, which draws a number for each of the means.
         bounds = probabilities.cumsum(dim=-1)
         drawn = torch.rand(bounds.shape[:-1]).to(bounds) * bounds[..., -1]
@@ -220,18 +217,17 @@ def impute(
         mean = possible[torch.arange(len(z)), chosen.clamp_max(possible.shape[1] - 1)]
         if number == NUM_WARM_UP:
             weights = counts(mean)
-        found, judged = posterior(mean, weights)
+        found, none = posterior(mean, weights)
         if number > NUM_WARM_UP and (number - NUM_WARM_UP) % APART == 0:
-            kept.extend(found.posteriors(judged))
+            kept.extend(found.posteriors(none))
     # They are not zero, even if the simulator is right in all of them.
     off = [max(1 - one.probability_of_none, 1e-290) for one in kept]
     shares = torch.cat([p * one.shares for p, one in zip(off, kept, strict=True)])
-    names = "probability_of_none", "log_evidence", "log_evidence_of_none"
+    names = "probability_of_none", "log_evidence", "num_independent"
     return replace(
         kept[0],
         terms=tuple(term for one in kept for term in one.terms),
         shares=shares / shares.sum(),
-        num_independent=fmean(one.num_independent for one in kept),
         **{name: fmean(getattr(one, name) for one in kept) for name in names},
     )
 

@@ -10,7 +10,6 @@ from torch import Tensor
 from torch.distributions import Chi2, MultivariateNormal
 
 from sbi_rope.utils.seeds import seeded
-from sbi_rope.utils.tensors import as_batch
 
 # Entries of the matrices that simulations are corrected by at a time.
 MAX_ENTRIES = 2**22
@@ -23,8 +22,7 @@ SMALLEST_ERROR = {"embedding": 0.01, "tuned": 0.01, "input": 0.003}
 # The prior precision of the offset is this share of the precision of the gain.
 OFFSET_PRECISION = 1 / 3
 # The prior precision of the gain is at least this times the noise C of each entry and
-# the number of entries. Otherwise, the noise of imprecise entries leaks into a precise
-# one, along directions in which the means of the pairs do not vary.
+# the number of entries, or the noise of imprecise entries leaks into a precise one.
 LEAST_PRECISION = 4.0
 # Settings with less than this share of the evidence of the best one are left out.
 NEGLIGIBLE = 1e-4
@@ -81,9 +79,7 @@ class Discrepancy:
         shares: The shares of the terms in the evidence, which sum to one.
         noise: The covariance C of simulations at one parameter, shape ``(l, l)``.
         probability_of_none: The probability that the simulator is right.
-        log_evidence: Log density of the pairs under a discrepancy, where each group
-            counts as one pair.
-        log_evidence_of_none: The same if the simulator is right.
+        log_evidence: Log density of the pairs under a discrepancy.
         num_independent: How many independent pairs the calibration pairs count as: the
             sum of their weights, or less if pairs of a group have errors in common.
     """
@@ -93,7 +89,6 @@ class Discrepancy:
     noise: Tensor = field(repr=False)
     probability_of_none: float
     log_evidence: float
-    log_evidence_of_none: float
     num_independent: float
 
     @torch.no_grad()
@@ -160,7 +155,7 @@ class DiscrepancyDraws(NamedTuple):
         Returns:
             Shape ``(n, l)``, float64.
         """
-        z_s = as_batch("z_s", z_s, self.offset.shape[1:]).double()
+        z_s = z_s.double()
         if draw is None:
             draw = torch.randint(len(self.offset), (len(z_s),)).to(z_s.device)
         noise = torch.randn(z_s.shape, dtype=torch.double).to(z_s)
@@ -206,14 +201,6 @@ def independent_pairs(
     number = groups.bincount(weights=w).square() / groups.bincount(weights=w.square())
     correlation = torch.as_tensor(correlation).to(w)[..., None]
     return w / (1 + (number[groups] - 1) * correlation)
-
-
-class Judged(NamedTuple):
-    """Whether the simulator is right, given each of B sets of means, ``(B,)``."""
-
-    off: Tensor  # the log density of the pairs under a discrepancy
-    right: Tensor  # that if the simulator is right
-    probability_of_none: Tensor
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -325,7 +312,12 @@ class Regressions:
             degrees=strength + scale.shape[-1] + 1 + self.num_pairs[b],
         )
 
-    def posteriors(self, judged: Judged) -> list[Discrepancy]:
+    def mean_log_evidence(self) -> Tensor:
+        """Return the log of the mean evidence of all priors, ``(B,)``."""
+        count = self.log_evidence[0].numel()
+        return self.log_evidence.logsumexp(dim=(1, 2)) - math.log(count)
+
+    def posteriors(self, probability_of_none: Tensor) -> list[Discrepancy]:
         """Return for each set the average over settings with evidence for them."""
         found = []
         for b, evidence in enumerate(self.log_evidence):
@@ -334,22 +326,21 @@ class Regressions:
                 terms=tuple(self.at(b, k, s) for k, s in kept.nonzero().tolist()),
                 shares=torch.softmax(evidence[kept], dim=0),
                 noise=self.noise,
-                probability_of_none=float(judged.probability_of_none[b]),
-                log_evidence=float(judged.off[b]),
-                log_evidence_of_none=float(judged.right[b]),
+                probability_of_none=float(probability_of_none[b]),
+                log_evidence=float(self.mean_log_evidence()[b]),
                 num_independent=float(self.num_pairs[b]),
             )
             found.append(one)
         return found
 
-    def draw(self, judged: Judged) -> tuple[Tensor, Tensor, Tensor]:
+    def draw(self, probability_of_none: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Draw a gain, an offset and the covariance of z given theta for each set."""
         probabilities = self.log_evidence.flatten(1).softmax(dim=1)
         chosen = torch.multinomial(probabilities, 1)[:, 0]
         b, count = torch.arange(len(chosen), device=chosen.device), len(self.settings)
         drawn = self.at(b, chosen // count, chosen % count).sample(1)
         gain, offset, covariance = (values[0] for values in drawn)
-        none = torch.rand(len(chosen)).to(gain) < judged.probability_of_none
+        none = torch.rand(len(chosen)).to(gain) < probability_of_none
         none, identity = none[:, None, None], torch.eye(len(self.noise)).to(gain)
         return (
             torch.where(none, identity, gain),

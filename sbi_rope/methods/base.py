@@ -40,7 +40,7 @@ KINDS: tuple[Kind, ...] = ("observations", "calibration", "simulations")
 
 
 class Data:
-    """What was appended, in float32, with x of one shape."""
+    """What was appended, in float32."""
 
     def __init__(self) -> None:
         self.tensors: dict[Kind, Any] = {}
@@ -70,8 +70,7 @@ class Method(ABC):
     """A method of inference: construct, append data, ``train``, ``build_posterior``.
 
     What is passed in is copied or only read. Appending data after a training asks for
-    another one, which starts anew. ``train`` and what appends return the method, so
-    that calls can be chained. Of data that do not fit nothing is added.
+    another one, which starts anew. Of data that do not fit nothing is added.
 
     A subclass says which data it ``sees`` and returns a posterior from ``_fit``.
     Options that a method has no use for raise a ``TypeError``.
@@ -147,19 +146,12 @@ class Method(ABC):
         self._history: History | None = None
 
     @classmethod
-    def from_posterior(
-        cls,
-        posterior: Any,
-        *,
-        simulations: tuple[Tensor, Tensor] | None = None,
-        **options: Any,
-    ) -> Self:
+    def from_posterior(cls, posterior: Any, **options: Any) -> Self:
         """Start from a trained NPE instead of training one.
 
         Args:
             posterior: What ``NPE(...).build_posterior()`` of sbi returns. It is copied
                 and never changed.
-            simulations: Pairs (theta, x) to append, with theta drawn from the prior.
             **options: Keyword arguments of the constructor, except for ``device`` and
                 what concerns the training of NPE.
 
@@ -178,8 +170,6 @@ class Method(ABC):
         method._theta_names = getattr(posterior, "parameter_names", None)
         method._x_names = getattr(posterior, "x_names", None)
         method._embedding_net = copy.deepcopy(embedding_of(estimator))
-        if simulations is not None:
-            method.append_simulations(*simulations)
         return method
 
     def append_simulations(self, theta: Tensor, x: Tensor) -> Self:
@@ -336,9 +326,9 @@ class Method(ABC):
         read = as_batch("theta", theta, shape, names=self._theta_names)
         return read.to(self._device, torch.float32, copy=True)
 
-    def _check_data(self, *kinds: Kind) -> None:
-        """Raise unless there are the data of these kinds, or of all, that it needs."""
-        for kind in kinds or KINDS:
+    def _check_data(self) -> None:
+        """Raise unless there are all data that it needs."""
+        for kind in KINDS:
             is_needed = self.needs_simulations if kind == "simulations" else True
             least = self.min_pairs if kind == "calibration" else 1
             count = len(self._data.tensors.get(kind, [()])[0])

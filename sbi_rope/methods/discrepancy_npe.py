@@ -108,8 +108,8 @@ class DiscrepancyNPE(Method):
     ) -> DiscrepancyReport:
         """Compare simulations with real observations, summary by summary.
 
-        The method need not be trained, and with a simulator it needs no appended
-        simulations. The report is about x itself, whatever ``space`` is.
+        The method need not be trained. The report is about x itself, whatever
+        ``space`` is.
 
         Args:
             summaries: A function from observations ``(n, *event)`` to a few summaries
@@ -118,13 +118,8 @@ class DiscrepancyNPE(Method):
             x_names: Names of the summaries; numbered if None.
             seed: Seed of the simulations, as in ``train``.
             show_progress_bars: As in ``train``.
-
-        Returns:
-            The gain, shift and error of each summary with 95 % intervals.
         """
-        self._check_data("calibration")
-        if self._simulator is None:
-            self._check_data("simulations")
+        self._check_data()
         pairs, show = self._data.pairs, is_shown(show_progress_bars)
         if pairs.x.ndim != 2 and summaries is None:
             raise InvalidInputError(
@@ -164,20 +159,13 @@ class DiscrepancyNPE(Method):
         theta_s, x_s = self._data.tensors.get("simulations") or source.from_prior(
             self.num_simulations, seed=0, progress=show
         )
-        if self.space == "input":
-            as_batch("x", pairs.x)
-            as_batch("x of simulations", x_s)
-        simulations = theta_s, embed(net, x_s)
+        simulations = theta_s, as_batch("x of simulations", embed(net, x_s))
+        z, learn_prior = as_batch("x", embed(net, pairs.x)), self.learn_prior
         version = fit_version(
-            pairs,
-            embed(net, pairs.x),
-            found,
-            simulations,
-            self.model,
-            learn_prior=self.learn_prior,
+            pairs, z, found, simulations, self.model, learn_prior=learn_prior
         )
         self._discrepancy, _ = version
-        correction = correct_flow(
+        flow, _, [history] = correct_flow(
             estimator,
             simulations,
             [version],
@@ -185,5 +173,4 @@ class DiscrepancyNPE(Method):
             num_steps=self.num_steps,
             show_progress_bars=show,
         )
-        corrected = posterior_from(npe, correction.flow.estimator(estimator))
-        return corrected, correction.histories[0]
+        return posterior_from(npe, flow.estimator(estimator)), history

@@ -66,8 +66,6 @@ class CalibrationFinetuner(Settings):
         simulations_per_target: The number of simulations in the mean that estimates
             each expectation. With 1, as in the paper, g is pulled towards the noise of
             single simulations.
-        resample_targets: Whether to draw new simulations in every epoch, as the paper
-            does, instead of once before the first.
         num_neighbors: With stored simulations, the expectation is estimated by the mean
             over this many simulations with the nearest parameters.
         validation_fraction: The share of the pairs that is held out, at most 0.5.
@@ -78,7 +76,6 @@ class CalibrationFinetuner(Settings):
     max_num_epochs: Count = 1000
     stop_after_epochs: Count = 200
     simulations_per_target: Count = 100
-    resample_targets: bool = False
     num_neighbors: Count = 1
     validation_fraction: Annotated[float, Range(0, 0.5)] = 0.2
     rehearsal: NotNegative = 0.0
@@ -93,7 +90,6 @@ class CalibrationFinetuner(Settings):
         groups: Tensor,
         weights: Tensor | None = None,
         draw_simulations: Callable[[int], Tensor],
-        draw_targets: Callable[[], Tensor] | None = None,
         show_progress_bars: bool = False,
     ) -> tuple[Ensemble, list[History]]:
         """Tune a copy of h on each of several sets of pairs, all at once.
@@ -102,9 +98,8 @@ class CalibrationFinetuner(Settings):
         ``sets`` the rows of the pairs x, ``(n_c, *event)``, that it may see. Of
         ``groups`` and ``weights`` there is a number for each pair, ``(n_c,)``; a group
         is held out as a whole. For ``rehearsal``, ``draw_simulations`` returns up to k
-        simulations from the prior, ``(k, *event)``; for ``resample_targets``,
-        ``draw_targets`` returns new targets for every epoch after the first. Return the
-        tuned nets, in evaluation mode, and the course of each training.
+        simulations from the prior, ``(k, *event)``. Return the tuned nets, in
+        evaluation mode, and the course of each training.
         """
         splits = []
         for rows in sets:
@@ -122,10 +117,10 @@ class CalibrationFinetuner(Settings):
         train, held_out = (
             side_by_side(rows, weights) for rows in zip(*every, strict=True)
         )
-        fixed = torch.stack([one for one in targets for _ in rates])
+        aims = torch.stack([one for one in targets for _ in rates])
         net = trainable_copy(h, targets[0])
         nets = Ensemble([net] * len(every), embedded, (x[:3],))
-        kept = None
+        kept: tuple[Tensor, ...] = ()
         if self.rehearsal:
             x_s = draw_simulations(NUM_REHEARSED).to(x.dtype)
             kept = x_s, embed(h, x_s)
@@ -139,19 +134,16 @@ class CalibrationFinetuner(Settings):
             return weighted_mean(distances(x[index], own), share)
 
         def batches(epoch: int) -> list[tuple[Tensor, ...]]:
-            new = draw_targets() if draw_targets and epoch else fixed
-            batch = *train, new.expand_as(fixed)
-            if kept is None:
-                return [batch]
+            if not kept:
+                return [(*train, aims)]
             some = torch.randint(len(kept[0]), (len(every), REHEARSED_IN_EPOCH))
-            some = some.to(x.device)
-            return [(*batch, kept[0][some], kept[1][some])]
+            return [(*train, aims, *(one[some.to(x.device)] for one in kept))]
 
-        def loss(*batch: Tensor) -> Tensor:
-            found = distance(*batch[:3])
-            if kept is None:
-                return found
-            return found + self.rehearsal * distances(*batch[3:]).mean(dim=1)
+        def loss(index: Tensor, share: Tensor, aims: Tensor, *kept: Tensor) -> Tensor:
+            found = distance(index, share, aims)
+            if kept:
+                found = found + self.rehearsal * distances(*kept).mean(dim=1)
+            return found
 
         histories = fit(
             nets,
@@ -159,7 +151,7 @@ class CalibrationFinetuner(Settings):
             loss,
             Training(stop_after_epochs=self.stop_after_epochs, clip_max_norm=None),
             validation_loss=distance if len(fewest) else None,
-            held_out=(*held_out, fixed),
+            held_out=(*held_out, aims),
             learning_rates=rates * len(sets),
             max_num_epochs=max_num_epochs,
             in_training_mode=False,

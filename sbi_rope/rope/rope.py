@@ -16,7 +16,7 @@ from sbi_rope.data.simulate import Source, moments, source_of, targets
 from sbi_rope.density import Coupled, MixturePosterior
 from sbi_rope.discrepancy.correction import tuning_targets
 from sbi_rope.npe.sbi import TrainedNPE, embed
-from sbi_rope.npe.standardisation import Standardisation, warn_of_far_entries
+from sbi_rope.npe.standardisation import warn_of_far_entries
 from sbi_rope.rope.finetuning import CalibrationFinetuner, History
 from sbi_rope.utils.errors import (
     InvalidInputError,
@@ -27,11 +27,7 @@ from sbi_rope.utils.errors import (
 from sbi_rope.utils.progress import is_shown
 from sbi_rope.utils.seeds import seeded
 from sbi_rope.utils.settings import Count, check
-from sbi_rope.utils.tensors import (
-    as_numbers,
-    column_names,
-    rows_with,
-)
+from sbi_rope.utils.tensors import as_numbers, column_names, rows_with
 
 # The number of simulations to couple with if the batch has fewer observations.
 MIN_SIMULATIONS = 1000
@@ -247,34 +243,25 @@ class RoPE:
             )
         pairs, show = self.pairs, is_shown(show_progress_bars)
         source, how, h = self.source, self.finetuner, self._embed
-
-        def draw_targets() -> Tensor:
-            of_pairs = source, pairs, how.simulations_per_target, h
+        of_pairs = source, pairs, how.simulations_per_target, h
+        with seeded(seed):
             if pairs.are_exact:
                 neighbors = how.num_neighbors
-                return targets(*of_pairs, num_neighbors=neighbors, progress=show)
-            _, x_s = source.from_prior(MIN_SIMULATIONS, seed=0, progress=show)
-            return tuning_targets(
-                h(pairs.x),
-                moments(*of_pairs, progress=show),
-                Standardisation(h(x_s).double()),
-                weights=pairs.weight,
-                groups=pairs.group,
-            )
-
-        def draw_simulations(n: int) -> Tensor:
-            return source.from_prior(n, seed=0, progress=show)[1]
-
-        with seeded(seed):
+                aims = targets(*of_pairs, num_neighbors=neighbors, progress=show)
+            else:
+                _, x_s = source.from_prior(MIN_SIMULATIONS, seed=0, progress=show)
+                found = moments(*of_pairs, progress=show)
+                aims = tuning_targets(pairs, h(pairs.x), found, h(x_s))
             nets, [self._history] = how.tuned(
                 self.npe.h,
                 pairs.x,
-                [draw_targets()],
+                [aims],
                 [torch.arange(len(pairs)).to(pairs.group)],
                 groups=pairs.group,
                 weights=pairs.weight,
-                draw_simulations=draw_simulations,
-                draw_targets=draw_targets if how.resample_targets else None,
+                draw_simulations=lambda n: source.from_prior(n, seed=0, progress=show)[
+                    1
+                ],
                 show_progress_bars=show,
             )
         self._g = nets.member(0)
@@ -368,11 +355,6 @@ class RoPE:
         It is an sbi posterior for any x, the paper's ablation "tuning-only".
         """
         return self.npe.posterior(self.tuned_embedding_net)
-
-    @property
-    def embedding_net(self) -> nn.Module:
-        """A copy of h, the embedding net of NPE with sbi's standardising layer."""
-        return copy.deepcopy(self.npe.h)
 
     @property
     def tuned_embedding_net(self) -> nn.Module:

@@ -240,7 +240,7 @@ def test_rope_makes_of_posteriors_of_the_family_others_that_can_be_pickled(
         assert (normalised >= log_prob - 1e-5).all()
 
     # The tuned posterior is the flow on the tuned embedding.
-    tuned, g, h = rope.tuned_posterior(), rope.tuned_embedding_net, rope.embedding_net
+    tuned, g, h = rope.tuned_posterior(), rope.tuned_embedding_net, rope.npe.h
     assert type(tuned) is DirectPosterior
     assert not torch.equal(embed(g, x_o), embed(h, x_o))
     q = headless(npe.posterior_estimator)

@@ -90,7 +90,7 @@ def test_misspecification_is_noticed_before_tuning_and_much_smaller_after() -> N
     rope = RoPE(npe, simulator=problems.simulate, finetuner=finetuner)
     rope.append_calibration(theta[:30], x[:30]).train(seed=0, show_progress_bars=False)
     simulated = problems.simulate(problems.box(2).sample((300,)))
-    h, g = rope.embedding_net, rope.tuned_embedding_net
+    h, g = rope.npe.h, rope.tuned_embedding_net
     before, after = (
         calculate_p_misspecification(
             embed(net, x[30:]), embed(h, simulated), n_shuffle=99

@@ -108,8 +108,8 @@ def test_x_that_is_too_long_without_a_net_is_refused_before_training() -> None:
     npe.append_simulations(THETA, x).train(max_num_epochs=1)
     rope = RoPE(npe.build_posterior(), simulations=(THETA, x))
     rope.append_calibration(THETA_CAL, x[::2])
-    method = DiscrepancyNPE.from_posterior(rope.npe.posterior(), simulations=(THETA, x))
-    method.append_calibration(THETA_CAL, x[::2])
+    method = DiscrepancyNPE.from_posterior(rope.npe.posterior())
+    method.append_simulations(THETA, x).append_calibration(THETA_CAL, x[::2])
     for train in (lambda: stack(rope, **DEFAULTS), lambda: method.train(**QUIET)):
         with pytest.raises(InvalidInputError, match="Train NPE with an embedding net"):
             train()

@@ -31,7 +31,7 @@ def rope(npe: Any = None, **options: Any) -> RoPE:
 def test_without_calibration_g_is_h() -> None:
     conductor = rope()
     posterior = conductor.build_posterior(X_O, seed=3)
-    h = conductor.embedding_net
+    h = conductor.npe.h
     with torch.no_grad():
         expected = SinkhornCoupler().couple(h(X_O), posterior.coupling.simulated)
     assert torch.allclose(posterior.weights, expected.weights)
