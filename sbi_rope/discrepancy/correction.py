@@ -26,11 +26,10 @@ from sbi_rope.training.fit import Courses, History, Training, fit
 from sbi_rope.utils.errors import InvalidInputError
 from sbi_rope.utils.seeds import seeded
 
-# What is corrected: h(x), x itself, or g(x) with nets g tuned on other pairs. In the
-# last case simulations are still represented by h(x), because g is tuned towards h.
+# What is corrected: h(x), x itself, or g(x) with nets g tuned on other pairs, which
+# move it towards h of simulations.
 Space = Literal["embedding", "input", "tuned"]
-# What a version is trained with: a discrepancy, and the probabilities with which it
-# draws simulations, which are equal if None.
+# A discrepancy, and the probabilities of drawing simulations, which are equal if None.
 Version = tuple[Discrepancy | LaplaceDiscrepancy, Tensor | None]
 
 # Draws of the discrepancy for a training, and the limit on the entries of all together.
@@ -40,8 +39,7 @@ NUM_DRAWS, MAX_ENTRIES, BLOCK = 2000, 2**24, 40
 MOST_ENTRIES = 500
 # More standard deviations than this refute that the simulator is right.
 LARGEST_SURPRISE = 5.0
-# Simulations in a step, and steps in a course. A whole network adapts slower than a
-# density behind a net.
+# Simulations in a step, and steps in a course.
 BEHIND_NET = Training(training_batch_size=80, learning_rate=1e-2, max_num_epochs=250)
 TRAINING = {
     "embedding": BEHIND_NET,
@@ -50,9 +48,9 @@ TRAINING = {
 }
 # Corrected simulations on which the loss before and after a course is compared.
 NUM_COMPARED = 1920
-# Courses follow each other until one gains less than 0.01 nats. In a stack a single one
-# is enough for most: a longer one follows only if the loss still falls by so many nats
-# in its last quarter. Chosen on calibration data, see benchmarks/choices.md.
+# Courses follow each other until one gains less than 0.01 nats. In a stack a longer one
+# follows only if the loss still falls by so many nats in the last quarter of the first.
+# Chosen on calibration data, see benchmarks/choices.md.
 COURSES = Courses(min_gain=0.01)
 IN_A_STACK = Courses(min_gain=0.01, min_fall=0.3, max_num=2)
 
@@ -135,9 +133,8 @@ def tuning_targets(
     r"""Return the targets ``(n, l)`` of the tuning, :math:`E[h(S(\theta)) \mid y, x]`.
 
     A net that is tuned to averages given a partial label y alone would forget what x
-    says about the other parameters. They are therefore also given x, under the
-    discrepancy model that is fitted to these pairs. There are embeddings z of the pairs
-    and z_s of simulations from the prior.
+    says about the other parameters. They are therefore also given x, under a
+    discrepancy model of the embeddings z of these pairs. z_s is from the prior.
     """
     unit, model = Standardisation(z_s.double()), DiscrepancyModel()
     found = fit_discrepancy(z, moments, unit, model, pairs.weight, pairs.group)
@@ -160,10 +157,9 @@ def surprise(
 
     If :math:`z_i` were a Gaussian simulation with the covariance :math:`C_i`, then
     :math:`T_i` would have the mean :math:`E_i = \operatorname{tr}(C^{-1} C_i)` and the
-    variance :math:`V_i = 2 \operatorname{tr}((C^{-1} C_i)^2)`. C is the mean of all
-    :math:`C_i`. Each group counts as one pair, with the means of its T, E and V: in the
-    worst case its pairs have everything in common. Of several possible means,
-    ``(n, R, l)``, the nearest counts.
+    variance :math:`V_i = 2 \operatorname{tr}((C^{-1} C_i)^2)`, with C the mean of all
+    :math:`C_i`. Each group counts as one pair, with the means of its T, E and V. Of
+    several possible means, ``(n, R, l)``, the nearest counts.
     """
     covariances = covariances + rounding(covariances.mean(dim=0)).diag()
     inverse = torch.linalg.inv(covariances.mean(dim=0))
@@ -200,11 +196,10 @@ def correct_flow(
     The optimum is the posterior with the discrepancy integrated out. Every step draws
     new rows, corrections and errors. With ``space="input"`` all of NPE is trained,
     otherwise the density alone, for ``num_steps`` or in courses, which end earlier in a
-    stack. With ``"tuned"`` the caller puts a tuned net and the constants in the place
-    of h. Simulations are theta ``(n_s, d)`` from the prior and z ``(n_s, l)``.
+    stack. Simulations are theta ``(n_s, d)`` from the prior and z ``(n_s, l)``.
 
     Return the copies, a module that replaces entries which do not vary in simulations,
-    for behind a net of real x, and the losses of each copy.
+    and the losses. With ``"tuned"`` the caller puts tuned nets and it in front.
     """
     theta, z = simulations
     whole, training = space == "input", TRAINING[space]

@@ -22,12 +22,11 @@ from sbi_rope.utils.settings import Settings, UnitInterval
 from sbi_rope.utils.tensors import as_batch
 
 # Ratios of the variance between groups to the one within them, and their prior. Those
-# below .2 matter for large groups only; together they are as probable as another one.
+# below .2 matter for large groups only.
 VARIANCE_RATIOS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 PRIOR_OF_RATIOS = (1 / 30,) * 5 + (1 / 6,) * 5
-# Chains that are run side by side. Their first imputations depend on the start. Those
-# that are kept are so far apart that they are nearly independent for labels as noisy as
-# the prior is wide.
+# Chains that are run side by side. The imputations that are kept are so far apart that
+# they are nearly independent for labels as noisy as the prior is wide.
 NUM_CHAINS, NUM_WARM_UP, NUM_KEPT, APART = 10, 100, 2, 30
 # Numbers in the largest tensor, unless one chain needs more.
 MAX_ENTRIES = 2**22
@@ -58,21 +57,18 @@ class DiscrepancyModel(Settings):
 
     so that posterior and evidence have closed forms. The shape V is I, or :math:`D^2`
     with the noise of simulations in each entry, relative to the largest: a precise
-    entry may have a smaller error, too. The noise in K keeps what is uncertain about A
-    from adding more than a quarter of :math:`\Sigma` to the noise. V and the
-    hyper-parameters k, s and :math:`\nu` are averaged over a grid, weighted by their
-    evidence, so that there is nothing to choose.
+    entry may have a smaller error, too. V and the hyper-parameters k, s and
+    :math:`\nu` are averaged over a grid, weighted by their evidence, so that there is
+    nothing to choose.
 
     Recordings of one person or specimen can have errors in common. If these have the
     correlation :math:`\rho`, a group of k pairs counts as
     :math:`k / (1 + (k - 1)\, \rho)` independent ones (Kish's design effect), with the
-    mean of :math:`\rho` over a grid, weighted by the evidence. The covariance of the
-    errors is that of all pairs, because a person can be unusual in some entries only.
+    mean of :math:`\rho` over a grid, weighted by the evidence.
 
     The average contains the model :math:`z_i \mid \theta_i \sim \mathcal N(m_i, C)`, in
     which the simulator is right. If it is, the probability of this model goes to one
-    with more pairs, and nothing is corrected, unless the noise of the simulator varies
-    by a factor of several with the parameters. :class:`DiscrepancyNPE` and stacks set
+    with more pairs, and nothing is corrected. :class:`DiscrepancyNPE` and stacks set
     the probability to zero if the pairs refute the simulator by themselves.
 
     All quantities are in standard deviations of simulations from the prior.
@@ -132,9 +128,8 @@ class DiscrepancyModel(Settings):
                 the pairs, shape ``(l, l)``.
             weights: How many pairs each pair counts as, shape ``(n,)``; one if None.
             groups: A number for each pair, shape ``(n,)``. Pairs with the same number,
-                such as recordings of one person, can have errors in common. None if all
-                are independent. Do not divide the weights by the number of recordings
-                as well: a group counts as fewer pairs anyway.
+                such as recordings of one person, can have errors in common, and count
+                as fewer. None if all are independent.
             seed: Seed of the imputations.
         """
         width, possible = np.shape(z)[-1:], np.shape(mean)[1:-1][:1]
@@ -147,9 +142,7 @@ class DiscrepancyModel(Settings):
         if groups is not None:
             groups = groups_of(as_batch("groups", groups, (), rows=len(z))).to(z.device)
             groups = None if len(groups.unique()) == len(z) else groups
-        once = weights
-        if groups is not None:
-            once = independent_pairs(groups, 1.0, weights)
+        once = weights if groups is None else independent_pairs(groups, 1.0, weights)
         precisions = z.new_tensor(self.gain_precisions)
         grids = z.new_tensor(self.error_scales), z.new_tensor(self.degrees_of_freedom)
         settings = torch.cartesian_prod(*grids)

@@ -56,8 +56,8 @@ class Term:
         r"""Draw :math:`A`, :math:`b` and :math:`\Sigma`, ``count`` of each term."""
         *batch, width, _ = self.error_factor.shape
         like = self.error_factor
-        # The Bartlett decomposition: T T' follows a Wishart distribution, so that
-        # L (T T')^-1 L' follows an inverse Wishart distribution with scale L L'.
+        # The Bartlett decomposition: T T' follows a Wishart distribution, and
+        # L (T T')^-1 L' an inverse Wishart distribution with scale L L'.
         degrees = self.degrees[..., None] - torch.arange(width).to(like)
         triangle = torch.randn(count, *batch, width, width).to(like).tril(-1)
         triangle = triangle + torch.diag_embed(Chi2(degrees).sample((count,)).sqrt())
@@ -80,8 +80,7 @@ class Discrepancy:
         noise: The covariance C of simulations at one parameter, shape ``(l, l)``.
         probability_of_none: The probability that the simulator is right.
         log_evidence: Log density of the pairs under a discrepancy.
-        num_independent: How many independent pairs the calibration pairs count as: the
-            sum of their weights, or less if pairs of a group have errors in common.
+        num_independent: How many independent pairs the calibration pairs count as.
     """
 
     terms: tuple[Term, ...] = field(repr=False)
@@ -98,14 +97,8 @@ class Discrepancy:
         r"""Draw gains, offsets and errors.
 
         A share ``probability_of_none`` of the draws corrects nothing. In the others the
-        error is without the simulator's own noise,
-        :math:`\Sigma' = \Sigma - A C A^\top`.
-
-        Args:
-            num_draws: Number of draws.
-            smallest_error: The least root of the eigenvalues of
-                :math:`D^{-1} \Sigma' D^{-1}`, see :class:`DiscrepancyModel`.
-            seed: Seed of the draws; None uses torch's state.
+        error is :math:`\Sigma' = \Sigma - A C A^\top`, where the roots of the eigenvalues
+        of :math:`D^{-1} \Sigma' D^{-1}` are at least ``smallest_error``.
         """
         none, scale = self.probability_of_none, noise_scale(self.noise)
         shares = torch.cat([(1 - none) * self.shares, self.shares.new_tensor([none])])

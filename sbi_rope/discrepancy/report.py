@@ -70,8 +70,7 @@ class SummaryDiscrepancy:
 class DiscrepancyReport:
     """The discrepancy of each summary, as estimated from calibration pairs.
 
-    Print it, draw it with :func:`sbi_rope.plots.discrepancy`, or make a table of
-    ``dataclasses.asdict(summary)`` for each of its summaries.
+    Print it, or draw it with :func:`sbi_rope.plots.discrepancy`.
 
     Attributes:
         summaries: The discrepancy of each summary, from the largest to the smallest.

@@ -1,7 +1,6 @@
 """Fine-tuning on real observations with known parameters, of a net and of NPE."""
 
 import copy
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -223,15 +222,13 @@ def finetune_flow(
 
     def losses(rows: Tensor, member: Tensor) -> Tensor:
         """Return the negative log densities of labels, ``(E, B)`` to ``(E, B)``."""
-        nodes, of_nodes = theta[member, rows], log_weights[member, rows]
+        nodes = theta[member, rows]
         z = flow.embeddings(x[rows]) if fixed is None else fixed[rows]
-        count = nodes.shape[2]
-        log_q = -flow.losses_given(
-            nodes.flatten(1, 2), z.repeat_interleave(count, dim=1)
-        )
-        log_q = log_q.unflatten(1, (-1, count)).double()
-        terms = torch.where(torch.isneginf(of_nodes), of_nodes, log_q + of_nodes)
-        return math.log(count) - terms.logsumexp(dim=2)
+        z = z.repeat_interleave(nodes.shape[2], dim=1)
+        log_q = -flow.losses_given(nodes.flatten(1, 2), z).reshape(-1, nodes.shape[2])
+        of_nodes = log_weights[member, rows].flatten(0, 1)
+        flat = Nodes(theta=nodes.flatten(0, 1), log_weights=of_nodes)
+        return -flat.log_mean(log_q).reshape(rows.shape)
 
     train, held_out = (
         side_by_side(_with_density(partial(losses, member=member), rows), weights)
