@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from sbi_rope.data.pairs import Pairs, group_means, groups_of
+from sbi_rope.data.pairs import Pairs, group_means
 from sbi_rope.data.parameters import learn_parameters
 from sbi_rope.data.simulate import Moments
 from sbi_rope.density.flow import Flow
@@ -75,22 +75,22 @@ def network_of(estimator: ConditionalEstimator, space: Space) -> nn.Module:
 
 
 def fit_discrepancy(
+    pairs: Pairs,
     z: Tensor,
     moments: Moments,
     standardisation: Standardisation,
     model: DiscrepancyModel,
-    weights: Tensor | None = None,
-    groups: Tensor | None = None,
 ) -> Discrepancy:
     """Fit the model to pairs, represented by z ``(n, l)``, in units of simulations."""
-    z, unit = standardisation(z.double()), in_units(moments, standardisation)
+    z, moments = standardisation(z.double()), in_units(moments, standardisation)
     # With few pairs and many entries, a right simulator that fits badly can have more
-    # evidence than all discrepancies, each of which has many coefficients to learn.
-    found = surprise(z, unit.means, unit.covariance, weights, groups)
+    # evidence than all discrepancies, which have many coefficients to learn.
+    found = surprise(pairs, z, moments)
     if found > LARGEST_SURPRISE and model.probability_of_none < 1.0:
         model = replace(model, probability_of_none=0.0)
-    covariance = unit.covariance.mean(dim=0)
-    return model.fit(z, unit.means, covariance, weights=weights, groups=groups)
+    weights, groups = pairs.weight, pairs.group
+    covariance = moments.covariance.mean(dim=0)
+    return model.fit(z, moments.means, covariance, weights=weights, groups=groups)
 
 
 def fit_version(
@@ -105,7 +105,7 @@ def fit_version(
     """Return what pairs say of the discrepancy, and of the parameters if learned."""
     theta_s, z_s = simulations
     unit = Standardisation(z_s.double())
-    found = fit_discrepancy(z, moments, unit, model, pairs.weight, pairs.group)
+    found = fit_discrepancy(pairs, z, moments, unit, model)
     if not learn_prior:
         return found, None
     weights = pairs.shared_weight
@@ -136,20 +136,14 @@ def tuning_targets(
     says about the other parameters. They are therefore also given x, under a
     discrepancy model of the embeddings z of these pairs. z_s is from the prior.
     """
-    unit, model = Standardisation(z_s.double()), DiscrepancyModel()
-    found = fit_discrepancy(z, moments, unit, model, pairs.weight, pairs.group)
+    unit = Standardisation(z_s.double())
+    found = fit_discrepancy(pairs, z, moments, unit, DiscrepancyModel())
     with seeded(seed):
         means = expected_means(found, unit(z.double()), unit(moments.means))
     return unit.undo(means).to(z)
 
 
-def surprise(
-    z: Tensor,
-    means: Tensor,
-    covariances: Tensor,
-    weights: Tensor | None = None,
-    groups: Tensor | None = None,
-) -> float:
+def surprise(pairs: Pairs, z: Tensor, moments: Moments) -> float:
     r"""Return how badly a right simulator would fit, in standard deviations.
 
     .. math:: \frac{\sum_i w_i (T_i - E_i)}{\sqrt{\sum_i w_i^2 V_i}}, \qquad
@@ -161,17 +155,16 @@ def surprise(
     :math:`C_i`. Each group counts as one pair, with the means of its T, E and V. Of
     several possible means, ``(n, R, l)``, the nearest counts.
     """
+    covariances = moments.covariance
     covariances = covariances + rounding(covariances.mean(dim=0)).diag()
     inverse = torch.linalg.inv(covariances.mean(dim=0))
-    residual = z.to(covariances)[:, None] - means
+    residual = z.to(covariances)[:, None] - moments.means
     found = (residual @ inverse * residual).sum(dim=2).amin(dim=1)
     relative = inverse @ covariances
     excess = found - relative.diagonal(dim1=1, dim2=2).sum(dim=1)
     variance = 2 * (relative * relative.mT).sum(dim=(1, 2))
-    w = torch.ones_like(found) if weights is None else weights.to(found)
-    numbers = groups_of(torch.arange(len(z)) if groups is None else groups)
-    shared = w / numbers.bincount()[numbers].to(w)
-    values, w = group_means(torch.stack([excess, variance], 1), shared, numbers)
+    values = torch.stack([excess, variance], dim=1)
+    values, w = group_means(values, pairs.shared_weight, pairs.group)
     excess, variance = values.T
     return float((w * excess).sum() / (w.square() * variance).sum().sqrt())
 
@@ -240,9 +233,7 @@ def correct_flow(
 
     def compared_loss(*held_out: Tensor) -> Tensor:
         with seeded(0):  # the loss of a vector field draws random times
-            parts = (one.split(training.training_batch_size, dim=1) for one in held_out)
-            of_each = [mean_loss(*some) for some in zip(*parts, strict=True)]
-        return torch.stack(of_each).mean(dim=0)
+            return mean_loss(*held_out)
 
     histories = fit(
         flow if whole else flow.densities,

@@ -106,7 +106,6 @@ class DiscrepancyModel(Settings):
         *,
         weights: Tensor | None = None,
         groups: Tensor | None = None,
-        seed: int = 0,
     ) -> Discrepancy:
         r"""Return the posterior of the discrepancy given calibration pairs, in float64.
 
@@ -130,7 +129,6 @@ class DiscrepancyModel(Settings):
             groups: A number for each pair, shape ``(n,)``. Pairs with the same number,
                 such as recordings of one person, can have errors in common, and count
                 as fewer. None if all are independent.
-            seed: Seed of the imputations.
         """
         width, possible = np.shape(z)[-1:], np.shape(mean)[1:-1][:1]
         z = as_batch("z", z, width).double()
@@ -177,7 +175,7 @@ class DiscrepancyModel(Settings):
             return found, torch.sigmoid(right - judged.mean_log_evidence() + prior)
 
         if possible and possible != (1,):
-            with seeded(seed):
+            with seeded(0):
                 return impute(z, mean, posterior, counts)
         mean = mean.reshape(1, *z.shape)
         found, none = posterior(mean, counts(mean))
@@ -216,7 +214,7 @@ def impute(
     # They are not zero, even if the simulator is right in all of them.
     off = [max(1 - one.probability_of_none, 1e-290) for one in kept]
     shares = torch.cat([p * one.shares for p, one in zip(off, kept, strict=True)])
-    names = "probability_of_none", "log_evidence", "num_independent"
+    names = "probability_of_none", "log_evidence"
     return replace(
         kept[0],
         terms=tuple(term for one in kept for term in one.terms),

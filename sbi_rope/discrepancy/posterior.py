@@ -11,8 +11,6 @@ from torch.distributions import Chi2, MultivariateNormal
 
 from sbi_rope.utils.seeds import seeded
 
-# Entries of the matrices that simulations are corrected by at a time.
-MAX_ENTRIES = 2**22
 # The smallest noise of an entry, relative to the largest, that is told apart from none.
 SMALLEST_SCALE = 0.01
 # The smallest standard deviations of noise and error, in those of simulations from the
@@ -80,7 +78,6 @@ class Discrepancy:
         noise: The covariance C of simulations at one parameter, shape ``(l, l)``.
         probability_of_none: The probability that the simulator is right.
         log_evidence: Log density of the pairs under a discrepancy.
-        num_independent: How many independent pairs the calibration pairs count as.
     """
 
     terms: tuple[Term, ...] = field(repr=False)
@@ -88,7 +85,6 @@ class Discrepancy:
     noise: Tensor = field(repr=False)
     probability_of_none: float
     log_evidence: float
-    num_independent: float
 
     @torch.no_grad()
     def sample(
@@ -97,8 +93,8 @@ class Discrepancy:
         r"""Draw gains, offsets and errors.
 
         A share ``probability_of_none`` of the draws corrects nothing. In the others the
-        error is :math:`\Sigma' = \Sigma - A C A^\top`, where the roots of the eigenvalues
-        of :math:`D^{-1} \Sigma' D^{-1}` are at least ``smallest_error``.
+        error is :math:`\Sigma' = \Sigma - A C A^\top`. The eigenvalues of
+        :math:`D^{-1} \Sigma' D^{-1}` have roots of at least ``smallest_error``.
         """
         none, scale = self.probability_of_none, noise_scale(self.noise)
         shares = torch.cat([(1 - none) * self.shares, self.shares.new_tensor([none])])
@@ -138,31 +134,18 @@ class DiscrepancyDraws(NamedTuple):
         return cls(*map(torch.cat, zip(*parts, strict=True)))
 
     def correct(self, z_s: Tensor, draw: Tensor | None = None) -> Tensor:
-        """Return simulations as they would be observed in reality, with own errors.
+        """Return simulations ``(n, l)`` as they would be observed, in float64.
 
-        Args:
-            z_s: Simulations, shape ``(n, l)``.
-            draw: The number of the draw for each, shape ``(n,)``, or for each of m
-                blocks of ``n / m`` simulations, ``(m,)``; random if None.
-
-        Returns:
-            Shape ``(n, l)``, float64.
+        ``draw`` is the number of the draw for each, ``(n,)``, or for each of m blocks
+        of ``n / m`` simulations, ``(m,)``; random if None.
         """
         z_s = z_s.double()
         if draw is None:
             draw = torch.randint(len(self.offset), (len(z_s),)).to(z_s.device)
         noise = torch.randn(z_s.shape, dtype=torch.double).to(z_s)
-        blocks = (one.reshape(len(draw), -1, z_s.shape[1]) for one in (z_s, noise))
-        # A matrix for each draw needs a lot of memory if z has many entries.
-        size = max(1, MAX_ENTRIES // z_s.shape[1] ** 2)
-        parts = zip(draw.split(size), *(one.split(size) for one in blocks), strict=True)
-        corrected = [
-            self.offset[which][:, None]
-            + z @ self.gain[which].mT
-            + standard @ self.error_factor[which].mT
-            for which, z, standard in parts
-        ]
-        return torch.cat(corrected).reshape_as(z_s)
+        z, noise = (one.reshape(len(draw), -1, z_s.shape[1]) for one in (z_s, noise))
+        moved = self.offset[draw][:, None] + z @ self.gain[draw].mT
+        return (moved + noise @ self.error_factor[draw].mT).reshape_as(z_s)
 
 
 def decorrelated(
@@ -321,7 +304,6 @@ class Regressions:
                 noise=self.noise,
                 probability_of_none=float(probability_of_none[b]),
                 log_evidence=float(self.mean_log_evidence()[b]),
-                num_independent=float(self.num_pairs[b]),
             )
             found.append(one)
         return found
