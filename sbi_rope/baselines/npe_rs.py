@@ -138,7 +138,7 @@ class NPERS(Method):
         embedding = embedding_of(estimator)
         simulations, observations = (
             rows[torch.randperm(len(rows))[:NUM_ROWS]]
-            for rows in (x, self._data.observations)
+            for rows in (x, self._data.observations[0])
         )
         # Batch normalisation would centre each of the two sets, and dropout is noise.
         embedding.eval()

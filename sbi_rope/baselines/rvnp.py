@@ -128,7 +128,7 @@ class RVNP(Method):
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
         theta, x = self._data.simulations
         net, _, density, estimator = clipped_statistics(npe, self.noise_on, x)
-        simulated, observed = embed(net, x), embed(net, self._data.observations)
+        simulated, observed = embed(net, x), embed(net, self._data.observations[0])
         standardise = standardisation_of_statistics(simulated)
         observed = as_batch("statistics of x_o", observed)
         s, y = standardise(simulated), standardise(observed)

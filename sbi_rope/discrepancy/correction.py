@@ -117,8 +117,8 @@ def in_units(moments: Moments, standardisation: Standardisation) -> Moments:
     varies = standardisation.varies
     if not varies.any():
         raise InvalidInputError(
-            "Expected simulations that differ from each other; got the same embedding "
-            "(or the same x) for all of them."
+            "Expected simulations that differ from each other; got the same x, or the "
+            "same embedding, for all of them."
         )
     std = standardisation.std[varies]
     return Moments(

@@ -46,10 +46,6 @@ class DiscrepancyNPE(Method):
     ``docs/background/discrepancy.md`` says when it fails. FMPE and NPSE posteriors can
     be corrected too.
 
-    References:
-        | Bayesian Calibration of Computer Models (Kennedy and O'Hagan, 2001)
-        | https://doi.org/10.1111/1467-9868.00294
-
     Args:
         prior, density_estimator, npe_training, simulator, device: See :class:`Method`.
         space: What is corrected, see above.
@@ -80,7 +76,6 @@ class DiscrepancyNPE(Method):
         **options: Any,
     ) -> None:
         check("space", space, Corrected)
-        check("learn_prior", learn_prior, bool)
         check("model", model, DiscrepancyModel | None)
         check("num_simulations", num_simulations, Annotated[int, Range(2)])
         check("num_steps", num_steps, Count | None)
@@ -116,8 +111,7 @@ class DiscrepancyNPE(Method):
                 of each, ``(n, k)``, such as the means of parts of an image. It may
                 return a NumPy array. If None, they are the entries of a vector x.
             x_names: Names of the summaries; numbered if None.
-            seed: Seed of the simulations, as in ``train``.
-            show_progress_bars: As in ``train``.
+            seed, show_progress_bars: As in ``train``.
         """
         self._check_data()
         pairs, show = self._data.pairs, is_shown(show_progress_bars)
@@ -152,15 +146,13 @@ class DiscrepancyNPE(Method):
         npe, _ = self._trained_npe(show_progress_bars=show)
         estimator, source = estimator_of(npe), self._source()
         warn_of_far_entries("x", pairs.x, embedding_of(estimator))
-        net = network_of(estimator, self.space)
-        found = moments(
-            source, pairs, SIMULATIONS_PER_PAIR, partial(embed, net), progress=show
-        )
-        theta_s, x_s = self._data.tensors.get("simulations") or source.from_prior(
+        h = partial(embed, network_of(estimator, self.space))
+        found = moments(source, pairs, SIMULATIONS_PER_PAIR, h, progress=show)
+        theta_s, x_s = self._data.simulations or source.from_prior(
             self.num_simulations, seed=0, progress=show
         )
-        simulations = theta_s, as_batch("x of simulations", embed(net, x_s))
-        z, learn_prior = as_batch("x", embed(net, pairs.x)), self.learn_prior
+        simulations = theta_s, as_batch("x of simulations", h(x_s))
+        z, learn_prior = as_batch("x", h(pairs.x)), self.learn_prior
         version = fit_version(
             pairs, z, found, simulations, self.model, learn_prior=learn_prior
         )

@@ -94,11 +94,9 @@ class CalibrationFinetuner(Settings):
         """Tune a copy of h on each of several sets of pairs, all at once.
 
         Of each copy, ``targets`` has the targets at all pairs, shape ``(n_c, l)``, and
-        ``sets`` the rows of the pairs x, ``(n_c, *event)``, that it may see. Of
-        ``groups`` and ``weights`` there is a number for each pair, ``(n_c,)``; a group
-        is held out as a whole. For ``rehearsal``, ``draw_simulations`` returns up to k
-        simulations from the prior, ``(k, *event)``. Return the tuned nets, in
-        evaluation mode, and the course of each training.
+        ``sets`` the rows of the pairs x, ``(n_c, *event)``, that it may see. There is a
+        group and a weight of each pair, ``(n_c,)``. ``draw_simulations`` returns up to
+        k simulations from the prior, ``(k, *event)``. Return the nets and their losses.
         """
         splits = []
         for rows in sets:
@@ -325,8 +323,7 @@ def trainable_copy(embedding_net: nn.Module, embeddings: Tensor) -> nn.Module:
     if not has_parameters(net):
         width = embeddings.shape[1]
         affine = nn.Linear(width, width).to(embeddings)
-        with torch.no_grad():
-            affine.weight.copy_(torch.eye(width))
-            affine.bias.zero_()
+        nn.init.eye_(affine.weight)
+        nn.init.zeros_(affine.bias)
         net = nn.Sequential(net, affine)
     return net.eval()

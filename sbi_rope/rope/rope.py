@@ -77,9 +77,8 @@ class RoPE:
         npe: A copy of the posterior, in its parts; ``npe.posterior()`` puts them
             together again.
         pairs: The calibration pairs appended so far, with draws of their parameters.
-        source: Where simulations come from; ``source.num_calls`` counts how many rows
-            of theta the simulator has simulated, and ``source.num_dropped`` those that
-            were dropped because of NaN or Inf.
+        source: Where simulations come from; ``num_calls`` counts the rows of theta that
+            were simulated, and ``num_dropped`` those dropped because of NaN or Inf.
 
     Raises:
         UnsupportedPosteriorError: If the posterior has no embedding to work with, or if
@@ -159,9 +158,8 @@ class RoPE:
         Whatever needs the parameters is averaged over :math:`p(\theta \mid y)` under
         the prior.
 
-        Tensors, arrays, tables and lists of numbers are taken. The columns of a table
-        are put into the order of the names that RoPE knows. Rows of theta and x are
-        paired by position, not by their row labels.
+        The columns of a table are put into the order of the names that RoPE knows. Rows
+        of theta and x are paired by position, not by their row labels.
 
         Args:
             theta: Parameters, shape ``(n, d)``, inside the prior's support. NaN stands
@@ -307,6 +305,7 @@ class RoPE:
         """Couple a batch of real observations with simulations.
 
         After one training, it can be called for any number of batches and couplers.
+        There is a warning if a coupling has not converged.
 
         Args:
             x_o: The batch, shape ``(n_o, *event)``. Each posterior depends on the whole
@@ -314,12 +313,7 @@ class RoPE:
             coupler: Settings for this batch; those of this object if None.
             num_simulations: n_s; ``max(n_o, 1000)`` if None. Of stored simulations
                 there may be fewer.
-            seed: Seed of the simulations, as in :meth:`train`.
-            show_progress_bars: As in :meth:`train`.
-
-        Returns:
-            The posteriors of the batch. There is a warning if the coupling has not
-            converged.
+            seed, show_progress_bars: As in :meth:`train`.
 
         Raises:
             NotReadyError: If calibration pairs were appended after the last training.
