@@ -135,8 +135,7 @@ class Method(ABC):
         """Start from a trained NPE instead of training one.
 
         Args:
-            posterior: What ``NPE(...).build_posterior()`` of sbi returns. It is copied
-                and never changed.
+            posterior: What ``NPE(...).build_posterior()`` returns, which is copied.
             **options: Keyword arguments of the constructor, except for ``device`` and
                 what concerns the training of NPE.
 

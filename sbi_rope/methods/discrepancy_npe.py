@@ -111,7 +111,8 @@ class DiscrepancyNPE(Method):
                 of each, ``(n, k)``, such as the means of parts of an image. It may
                 return a NumPy array. If None, they are the entries of a vector x.
             x_names: Names of the summaries; numbered if None.
-            seed, show_progress_bars: As in ``train``.
+            seed: As in ``train``.
+            show_progress_bars: As in ``train``.
         """
         self._check_data()
         pairs, show = self._data.pairs, is_shown(show_progress_bars)

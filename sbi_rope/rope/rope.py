@@ -74,8 +74,7 @@ class RoPE:
             table of parameters, or "theta_1" and so on.
 
     Attributes:
-        npe: A copy of the posterior, in its parts; ``npe.posterior()`` puts them
-            together again.
+        npe: A copy of the posterior, in its parts.
         pairs: The calibration pairs appended so far, with draws of their parameters.
         source: Where simulations come from; ``num_calls`` counts the rows of theta that
             were simulated, and ``num_dropped`` those dropped because of NaN or Inf.
@@ -313,7 +312,8 @@ class RoPE:
             coupler: Settings for this batch; those of this object if None.
             num_simulations: n_s; ``max(n_o, 1000)`` if None. Of stored simulations
                 there may be fewer.
-            seed, show_progress_bars: As in :meth:`train`.
+            seed: As in :meth:`train`.
+            show_progress_bars: As in :meth:`train`.
 
         Raises:
             NotReadyError: If calibration pairs were appended after the last training.
