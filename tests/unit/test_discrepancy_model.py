@@ -190,32 +190,6 @@ def test_a_group_counts_as_many_pairs_as_its_errors_are_independent() -> None:
     assert once == pytest.approx(alone, rel=0.15)
 
 
-def test_sets_of_means_have_each_the_posterior_that_they_have_alone() -> None:
-    z, mean = pairs(9, 2)
-    means = mean + 0.3 * torch.randn(4, 9, 2)
-    groups, correlations = torch.arange(9) // 3, torch.tensor([0.0, 0.2, 0.5, 0.9])
-    weights = independent_pairs(groups, correlations, torch.rand(9) + 0.5)
-    assert weights.shape == (4, 9)
-
-    def regressions(some: slice) -> Regressions:
-        return Regressions.of(
-            z,
-            means[some],
-            weights[some],
-            torch.tensor([0.1, 1.0]).double(),
-            noise=0.1 * torch.eye(2).double(),
-            settings=torch.tensor([[0.1, 1.0], [0.4, 3.0]]).double(),
-        )
-
-    together = regressions(slice(None))
-    for b in range(4):
-        alone = regressions(slice(b, b + 1))
-        assert torch.allclose(alone.log_evidence[0], together.log_evidence[b])
-        expected, found = alone.at(0, 1, 1), together.at(b, 1, 1)
-        for name, part in vars(found).items():  # signs of eigenvectors may differ
-            assert torch.allclose(part.abs(), getattr(expected, name).abs())
-
-
 def test_weights_that_differ_within_a_group_count_by_their_effective_number() -> None:
     # The variance of their mean is that of correlated errors, summed by hand.
     groups, weights, rho = torch.tensor([0, 0, 1]), torch.tensor([2.0, 1.0, 3.0]), 0.5
@@ -271,18 +245,6 @@ def test_simulations_are_corrected_by_gain_offset_and_error() -> None:
     draws = draws._replace(error_factor=torch.zeros_like(draws.error_factor))
     corrected = draws.correct(z_s[:12], torch.tensor([4, 0, 5]))
     assert torch.allclose(corrected, moved[[4, 0, 5]].repeat_interleave(4, dim=0))
-
-
-def test_draws_are_finite_for_degenerate_pairs() -> None:
-    collinear = torch.randn(10, 1).repeat(1, 3)
-    for case, z, mean in (
-        ("collinear", collinear, collinear),
-        ("two equal pairs", torch.ones(2, 3), torch.zeros(2, 3)),
-        ("more entries than pairs", torch.randn(10, 20), torch.randn(10, 20)),
-    ):
-        found = certainly_off(DiscrepancyModel()).fit(z, mean, no_noise(z.shape[1]))
-        corrected = found.sample(50, seed=0).correct(torch.randn_like(z))
-        assert corrected.isfinite().all(), case
 
 
 @pytest.mark.medium

@@ -60,29 +60,26 @@ def log_probs(posterior: Any, x: Tensor, theta: Tensor | None = None) -> Tensor:
 @pytest.mark.medium
 @pytest.mark.filterwarnings("error::sbi_rope.utils.errors.RoPEWarning")
 @pytest.mark.parametrize("space", SPACES)
-def test_every_source_of_simulations_gives_a_posterior_of_sbi(space: Any) -> None:
+def test_simulators_and_stored_simulations_correct_a_posterior_of_sbi(
+    space: Any,
+) -> None:
     x, stored = labelled(4)[1], problems.box(2).sample((300,))
-    builder = posterior_nn("maf", hidden_features=10, num_transforms=1)
-    options: dict[str, Any] = {"npe_training": SHORT, "space": space, **SMALL}
-    for name, made in {
-        "simulator": method(space=space),
-        "simulations": method(space=space, simulator=None),
-        "both": method(space=space),
-        "scratch": DiscrepancyNPE(problems.box(2), builder, **options),
-    }.items():
-        if name != "simulator":
-            made.append_simulations(stored, problems.simulate(stored))
-        made.append_calibration(*labelled()).train(**QUIET)
-        posterior = made.build_posterior()
-        assert isinstance(posterior, DirectPosterior), name
+    for made in (
+        method(space=space),
+        method(space=space, simulator=None).append_simulations(
+            stored, problems.simulate(stored)
+        ),
+    ):
+        posterior = (
+            made.append_calibration(*labelled()).train(**QUIET).build_posterior()
+        )
+        assert isinstance(posterior, DirectPosterior)
         samples = posterior.sample_batched((7,), x, show_progress_bars=False)
-        assert samples.shape == (7, 4, 2), name
-        assert problems.box(2).support.check(samples).all(), name
+        assert problems.box(2).support.check(samples).all()
         found = log_probs(posterior, x)
-        assert found.isfinite().all(), name
-        assert not torch.equal(found, log_probs(problems.npe_posterior(), x)), name
-    with pytest.raises(NotReadyError, match=r"Call `train\(\)` first"):
-        _ = made.append_calibration(*labelled()).discrepancy
+        assert not torch.equal(found, log_probs(problems.npe_posterior(), x))
+        with pytest.raises(NotReadyError, match=r"Call `train\(\)` first"):
+            _ = made.append_calibration(*labelled()).discrepancy
 
 
 @pytest.mark.slow
