@@ -2,8 +2,7 @@
 
 import functools
 import math
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -42,20 +41,16 @@ def simulator(theta: Tensor) -> Tensor:
     return theta + NOISE * torch.randn_like(theta)
 
 
-@dataclass(frozen=True)
-class Reality:
+class Reality(NamedTuple):
     """x_o = a theta + b + sd eps."""
 
     gain: float
     offset: float
     std: float
 
-    def __call__(self, theta: Tensor) -> Tensor:
-        return self.gain * theta + self.offset + self.std * torch.randn_like(theta)
-
     def labelled(self, n: int) -> tuple[Tensor, Tensor]:
         theta = torch.randn(n, 1)
-        return theta, self(theta)
+        return theta, self.gain * theta + self.offset + self.std * torch.randn(n, 1)
 
 
 def reality(seed: int) -> Reality:

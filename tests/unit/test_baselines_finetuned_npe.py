@@ -95,9 +95,7 @@ def test_of_several_learning_rates_and_the_start_the_best_is_kept() -> None:
 
 @pytest.mark.medium
 @pytest.mark.parametrize("space", [None, "embedding", "input"])
-def test_the_start_is_kept_if_nothing_is_better_and_can_be_a_corrected_npe(
-    space: Any,
-) -> None:
+def test_a_start_is_kept_if_nothing_is_better_corrected_or_not(space: Any) -> None:
     start = npe()
     if space:
         options = {"space": space, "num_simulations": 500, "num_steps": 40}

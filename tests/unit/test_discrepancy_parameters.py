@@ -36,9 +36,7 @@ def step_ahead(
     return evidence, np.atleast_1d(log_t(new))
 
 
-def test_evidence_and_prediction_agree_with_updates_by_one_pair_after_the_other() -> (
-    None
-):
+def test_evidence_and_prediction_are_those_of_one_update_after_the_other() -> None:
     for d in (1, 2):
         u = torch.randn(7, d).double() * 0.5 + 0.8
         new, correlation = torch.randn(5, d).double(), CORRELATION[:d, :d]

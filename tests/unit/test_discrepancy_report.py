@@ -42,6 +42,10 @@ def inside(value: float, interval: Interval) -> bool:
     return interval.low <= value <= interval.high
 
 
+def test_an_interval_holds_95_percent_of_the_draws() -> None:
+    assert Interval.of(torch.arange(1001.0)) == Interval(500.0, 25.0, 975.0)
+
+
 def test_a_planted_discrepancy_is_found_in_units_of_x_and_no_other() -> None:
     found = report_discrepancy(*pairs(200), simulated(5000), model=MODEL)
     found = found.renamed(NAMES)

@@ -109,9 +109,7 @@ def test_stored_simulations_can_replace_a_simulator() -> None:
     assert conductor.history.training_loss[0] == pytest.approx(0.0, abs=1e-6)
 
 
-def test_the_nearest_parameters_are_found_in_units_of_their_standard_deviations() -> (
-    None
-):
+def test_the_nearest_parameters_are_found_in_standard_deviations() -> None:
     x = torch.tensor([[0.0, 0.0], [0.0, 50.0], [1.0, 0.0]]).repeat(5, 1)
     # In plain units (0, 50) is nearest. In standard deviations, about 0.5 and 24, 40 of
     # the second parameter count for less than 0.9 of the first.
