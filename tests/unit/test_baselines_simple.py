@@ -196,7 +196,10 @@ class TestRoPEsParts:
         }
         rope = RoPE(quick_posterior(), **options)
         rope.append_calibration(*real()).train(**QUIET)
+        stored_pairs = options.pop("simulations", None)
         method = TuningOnly.from_posterior(quick_posterior(), **options)
+        if stored_pairs:
+            method.append_simulations(*stored_pairs)
         method.append_calibration(*real()).train(**QUIET)
         expected = log_probs(rope.tuned_posterior(), self.THETA, self.X)
         scored = log_probs(method.build_posterior(), self.THETA, self.X)
@@ -211,7 +214,10 @@ class TestRoPEsParts:
         _, x_o = TASK.get_test_set(30)
         rope = RoPE(quick_posterior(), **options)
         expected = rope.build_posterior(x_o, num_simulations=50, seed=0)
+        stored_pairs = options.pop("simulations", None)
         method = OTOnly.from_posterior(quick_posterior(), num_simulations=50, **options)
+        if stored_pairs:
+            method.append_simulations(*stored_pairs)
         mixture = method.append_observations(x_o).train(**QUIET).build_posterior()
         assert torch.equal(mixture.weights, expected.weights)
         assert torch.equal(
