@@ -121,8 +121,6 @@ def paper(task: Task) -> Settings:
             learning_rate=stated.finetuning_learning_rate or 1e-4,
             max_num_epochs=stated.finetuning_steps or 5000,
             stop_after_epochs=stated.finetuning_steps or 5000,
-            simulations_per_target=1,
-            resample_targets=True,
         ),
     )
 

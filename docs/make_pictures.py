@@ -126,9 +126,7 @@ def overview(rope: RoPE, npe: Any, theta: Tensor, x_o: Tensor) -> "Figure":
     """Draw the three steps of RoPE for the first observation."""
     posterior = rope.build_posterior(x_o, seed=0, **QUIET)
     with torch.no_grad():
-        before, after = (
-            net(x_o) for net in (rope.embedding_net, rope.tuned_embedding_net)
-        )
+        before, after = (net(x_o) for net in (rope.npe.h, rope.tuned_embedding_net))
     draws = posterior[0].sample((2000,), **QUIET)[:, SHOWN]
     return plots.overview(
         simulated=posterior.coupling.simulated,

@@ -169,7 +169,10 @@ class Study:
                 print(stacked.report, flush=True)
                 self._save(plots.stacking_report(stacked.report), f"stack_{name}")
                 if task.x_names:
-                    method = DiscrepancyNPE.from_posterior(npe, **source)
+                    simulator = source.get("simulator")
+                    method = DiscrepancyNPE.from_posterior(npe, simulator=simulator)
+                    if "simulations" in source:
+                        method.append_simulations(*source["simulations"])
                     method.append_calibration(theta_cal, x_cal)
                     report = method.report(x_names=task.x_names)
                     print(report, flush=True)
@@ -198,7 +201,7 @@ class Study:
         with torch.random.fork_rng(), torch.no_grad():
             torch.manual_seed(0)
             prior = task.get_prior().sample(torch.Size((2000,)))
-            h, g = rope.embedding_net, rope.tuned_embedding_net
+            h, g = rope.npe.h, rope.tuned_embedding_net
             before, after = h(x_o), g(x_o)
             samples = {
                 "NPE": npe.sample(

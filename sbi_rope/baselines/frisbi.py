@@ -112,11 +112,11 @@ class FRISBI(Method):
             density,
             trainable_copy(h, z),
             torch.cat([embedding(simulated), z]),
-            self._data.observations.shape[1:],
+            self._data.observations[0].shape[1:],
             self.gamma,
         )
         theta, x = self._data.calibration
-        x_o = self._data.observations
+        x_o = self._data.observations[0]
         train, held_out = split_pairs(theta, self.training.validation_fraction)
 
         def error(pairs: Tensor) -> Tensor:
@@ -140,7 +140,7 @@ class FRISBI(Method):
 
     def _distilled(self, aligned: "Aligned", *, show_progress_bars: bool) -> Flow:
         """Return a density given g(x) that is trained on draws of the mixture."""
-        x_o = self._data.observations
+        x_o = self._data.observations[0]
         theta = aligned.sample(torch.Size((NUM_DRAWS,)), x_o).flatten(0, 1)
         z, number = embed(aligned.g, x_o), torch.arange(len(x_o)).repeat(NUM_DRAWS)
         density = copy.deepcopy(aligned.density).requires_grad_()

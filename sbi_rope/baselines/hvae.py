@@ -114,7 +114,7 @@ class HVAE(Method):
                 )
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
         h, density = frozen_statistics(npe)
-        seen = torch.cat([self._data.observations, self._data.calibration[1]])
+        seen = torch.cat([self._data.observations[0], self._data.calibration[1]])
         model = HybridVAE(
             LatentEncoder(h, LATENT_DIM, seen),
             ConditionalUNet(seen, LATENT_DIM, width=self.width),
@@ -132,7 +132,7 @@ class HVAE(Method):
         )
         theta, x = self._data.calibration
         train, held_out = split_pairs(theta, self.training.validation_fraction)
-        unlabelled = torch.cat([self._data.observations, x[train]])
+        unlabelled = torch.cat([self._data.observations[0], x[train]])
 
         def loss(rows: Tensor) -> Tensor:
             order = train[torch.randperm(len(train))]

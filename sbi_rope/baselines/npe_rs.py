@@ -139,7 +139,7 @@ class NPERS(Method):
         embedding.eval()
         simulated, observed = (
             embedding(rows[torch.randperm(len(rows))[:NUM_ROWS]]).flatten(1)
-            for rows in (x, self._data.observations)
+            for rows in (x, self._data.observations[0])
         )
         embedding.train()
         return self.regularisation * squared_mmd(simulated, observed)

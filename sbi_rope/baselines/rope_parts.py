@@ -100,7 +100,7 @@ class OTOnly(Method):
             coupler=self.coupler,
         )
         posterior = rope.build_posterior(
-            self._data.observations,
+            self._data.observations[0],
             num_simulations=self.num_simulations,
             show_progress_bars=show_progress_bars,
         )

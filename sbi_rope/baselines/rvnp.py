@@ -124,7 +124,7 @@ class RVNP(Method):
         theta, x = self._data.simulations
         net, _, density, estimator = clipped_statistics(npe, self.noise_on, x)
         simulated = statistics_of(net, x)
-        observed = statistics_of(net, self._data.observations)
+        observed = statistics_of(net, self._data.observations[0])
         standardise = Standardisation(simulated)
         s, y = standardise(simulated), standardise(observed)
         surrogate = fit_surrogate(

@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
-from sbi_rope.data.pairs import Pairs, group_means, groups_of
+from sbi_rope.data.pairs import Pairs, group_means
 from sbi_rope.data.parameters import learn_parameters
 from sbi_rope.data.simulate import Moments
 from sbi_rope.density.flow import Flow
@@ -26,11 +26,10 @@ from sbi_rope.training.fit import Courses, History, Training, fit
 from sbi_rope.utils.errors import InvalidInputError
 from sbi_rope.utils.seeds import seeded
 
-# What is corrected: h(x), x itself, or g(x) with nets g tuned on other pairs. In the
-# last case simulations are still represented by h(x), because g is tuned towards h.
+# What is corrected: h(x), x itself, or g(x) with nets g tuned on other pairs, which
+# move it towards h of simulations.
 Space = Literal["embedding", "input", "tuned"]
-# What a version is trained with: a discrepancy, and the probabilities with which it
-# draws simulations, which are equal if None.
+# A discrepancy, and the probabilities of drawing simulations, which are equal if None.
 Version = tuple[Discrepancy | LaplaceDiscrepancy, Tensor | None]
 
 # Draws of the discrepancy for a training, and the limit on the entries of all together.
@@ -40,8 +39,7 @@ NUM_DRAWS, MAX_ENTRIES, BLOCK = 2000, 2**24, 40
 MOST_ENTRIES = 500
 # More standard deviations than this refute that the simulator is right.
 LARGEST_SURPRISE = 5.0
-# Simulations in a step, and steps in a course. A whole network adapts slower than a
-# density behind a net.
+# Simulations in a step, and steps in a course.
 BEHIND_NET = Training(training_batch_size=80, learning_rate=1e-2, max_num_epochs=250)
 TRAINING = {
     "embedding": BEHIND_NET,
@@ -50,21 +48,11 @@ TRAINING = {
 }
 # Corrected simulations on which the loss before and after a course is compared.
 NUM_COMPARED = 1920
-# Courses follow each other until one gains less than 0.01 nats. In a stack a single one
-# is enough for most: a longer one follows only if the loss still falls by so many nats
-# in its last quarter. Chosen on calibration data, see benchmarks/choices.md.
+# Courses follow each other until one gains less than 0.01 nats. In a stack a longer one
+# follows only if the loss still falls by so many nats in the last quarter of the first.
+# Chosen on calibration data, see benchmarks/choices.md.
 COURSES = Courses(min_gain=0.01)
 IN_A_STACK = Courses(min_gain=0.01, min_fall=0.3, max_num=2)
-
-
-@dataclass(frozen=True, eq=False)
-class Correction:
-    """Copies of NPE that were trained on corrected simulations, and their losses."""
-
-    flow: Flow
-    # Replaces entries that do not vary in simulations, behind a net of real x.
-    constants: nn.Module
-    histories: list[History]
 
 
 def network_of(estimator: ConditionalEstimator, space: Space) -> nn.Module:
@@ -87,27 +75,22 @@ def network_of(estimator: ConditionalEstimator, space: Space) -> nn.Module:
 
 
 def fit_discrepancy(
+    pairs: Pairs,
     z: Tensor,
     moments: Moments,
     standardisation: Standardisation,
     model: DiscrepancyModel,
-    weights: Tensor | None = None,
-    groups: Tensor | None = None,
 ) -> Discrepancy:
     """Fit the model to pairs, represented by z ``(n, l)``, in units of simulations."""
-    if not standardisation.varies.any():
-        raise InvalidInputError(
-            "Expected simulations that differ from each other; got the same embedding "
-            "(or the same x) for all of them."
-        )
-    z, unit = standardisation(z.double()), in_units(moments, standardisation)
+    z, moments = standardisation(z.double()), in_units(moments, standardisation)
     # With few pairs and many entries, a right simulator that fits badly can have more
-    # evidence than all discrepancies, each of which has many coefficients to learn.
-    found = surprise(z, unit.means, unit.covariance, weights, groups)
+    # evidence than all discrepancies, which have many coefficients to learn.
+    found = surprise(pairs, z, moments)
     if found > LARGEST_SURPRISE and model.probability_of_none < 1.0:
         model = replace(model, probability_of_none=0.0)
-    covariance = unit.covariance.mean(dim=0)
-    return model.fit(z, unit.means, covariance, weights=weights, groups=groups)
+    weights, groups = pairs.weight, pairs.group
+    covariance = moments.covariance.mean(dim=0)
+    return model.fit(z, moments.means, covariance, weights=weights, groups=groups)
 
 
 def fit_version(
@@ -122,7 +105,7 @@ def fit_version(
     """Return what pairs say of the discrepancy, and of the parameters if learned."""
     theta_s, z_s = simulations
     unit = Standardisation(z_s.double())
-    found = fit_discrepancy(z, moments, unit, model, pairs.weight, pairs.group)
+    found = fit_discrepancy(pairs, z, moments, unit, model)
     if not learn_prior:
         return found, None
     weights = pairs.shared_weight
@@ -132,6 +115,11 @@ def fit_version(
 def in_units(moments: Moments, standardisation: Standardisation) -> Moments:
     """Return moments of the entries that vary, in their standard deviations."""
     varies = standardisation.varies
+    if not varies.any():
+        raise InvalidInputError(
+            "Expected simulations that differ from each other; got the same x, or the "
+            "same embedding, for all of them."
+        )
     std = standardisation.std[varies]
     return Moments(
         means=standardisation(moments.means),
@@ -140,35 +128,22 @@ def in_units(moments: Moments, standardisation: Standardisation) -> Moments:
 
 
 def tuning_targets(
-    z: Tensor,
-    moments: Moments,
-    standardisation: Standardisation,
-    weights: Tensor | None = None,
-    groups: Tensor | None = None,
-    *,
-    seed: int | None = None,
+    pairs: Pairs, z: Tensor, moments: Moments, z_s: Tensor, *, seed: int | None = None
 ) -> Tensor:
     r"""Return the targets ``(n, l)`` of the tuning, :math:`E[h(S(\theta)) \mid y, x]`.
 
     A net that is tuned to averages given a partial label y alone would forget what x
-    says about the other parameters. They are therefore also given x, under the
-    discrepancy model that is fitted to these pairs.
+    says about the other parameters. They are therefore also given x, under a
+    discrepancy model of the embeddings z of these pairs. z_s is from the prior.
     """
-    model = DiscrepancyModel()
-    found = fit_discrepancy(z, moments, standardisation, model, weights, groups)
-    possible = standardisation(moments.means)
+    unit = Standardisation(z_s.double())
+    found = fit_discrepancy(pairs, z, moments, unit, DiscrepancyModel())
     with seeded(seed):
-        means = expected_means(found, standardisation(z.double()), possible)
-    return standardisation.undo(means).to(z)
+        means = expected_means(found, unit(z.double()), unit(moments.means))
+    return unit.undo(means).to(z)
 
 
-def surprise(
-    z: Tensor,
-    means: Tensor,
-    covariances: Tensor,
-    weights: Tensor | None = None,
-    groups: Tensor | None = None,
-) -> float:
+def surprise(pairs: Pairs, z: Tensor, moments: Moments) -> float:
     r"""Return how badly a right simulator would fit, in standard deviations.
 
     .. math:: \frac{\sum_i w_i (T_i - E_i)}{\sqrt{\sum_i w_i^2 V_i}}, \qquad
@@ -176,22 +151,20 @@ def surprise(
 
     If :math:`z_i` were a Gaussian simulation with the covariance :math:`C_i`, then
     :math:`T_i` would have the mean :math:`E_i = \operatorname{tr}(C^{-1} C_i)` and the
-    variance :math:`V_i = 2 \operatorname{tr}((C^{-1} C_i)^2)`. C is the mean of all
-    :math:`C_i`. Each group counts as one pair, with the means of its T, E and V: in the
-    worst case its pairs have everything in common. Of several possible means,
-    ``(n, R, l)``, the nearest counts.
+    variance :math:`V_i = 2 \operatorname{tr}((C^{-1} C_i)^2)`, with C the mean of all
+    :math:`C_i`. Each group counts as one pair, with the means of its T, E and V. Of
+    several possible means, ``(n, R, l)``, the nearest counts.
     """
+    covariances = moments.covariance
     covariances = covariances + rounding(covariances.mean(dim=0)).diag()
     inverse = torch.linalg.inv(covariances.mean(dim=0))
-    residual = z.to(covariances)[:, None] - means
+    residual = z.to(covariances)[:, None] - moments.means
     found = (residual @ inverse * residual).sum(dim=2).amin(dim=1)
     relative = inverse @ covariances
     excess = found - relative.diagonal(dim1=1, dim2=2).sum(dim=1)
     variance = 2 * (relative * relative.mT).sum(dim=(1, 2))
-    w = torch.ones_like(found) if weights is None else weights.to(found)
-    numbers = groups_of(torch.arange(len(z)) if groups is None else groups)
-    shared = w / numbers.bincount()[numbers].to(w)
-    values, w = group_means(torch.stack([excess, variance], 1), shared, numbers)
+    values = torch.stack([excess, variance], dim=1)
+    values, w = group_means(values, pairs.shared_weight, pairs.group)
     excess, variance = values.T
     return float((w * excess).sum() / (w.square() * variance).sum().sqrt())
 
@@ -205,7 +178,7 @@ def correct_flow(
     num_steps: int | None = None,
     in_a_stack: bool = False,
     show_progress_bars: bool = False,
-) -> Correction:
+) -> tuple[Flow, nn.Module, list[History]]:
     r"""Train a copy of NPE for each version on corrected simulations, all at once.
 
     .. math::
@@ -216,15 +189,14 @@ def correct_flow(
     The optimum is the posterior with the discrepancy integrated out. Every step draws
     new rows, corrections and errors. With ``space="input"`` all of NPE is trained,
     otherwise the density alone, for ``num_steps`` or in courses, which end earlier in a
-    stack. With ``"tuned"`` the caller puts a tuned net and the constants in the place
-    of h. Simulations are theta ``(n_s, d)`` from the prior and z ``(n_s, l)``.
+    stack. Simulations are theta ``(n_s, d)`` from the prior and z ``(n_s, l)``.
+
+    Return the copies, a module that replaces entries which do not vary in simulations,
+    and the losses. With ``"tuned"`` the caller puts tuned nets and it in front.
     """
     theta, z = simulations
-    whole, training, unit = (
-        space == "input",
-        TRAINING[space],
-        Standardisation(z.double()),
-    )
+    whole, training = space == "input", TRAINING[space]
+    unit = Standardisation(z.double())
     z, count, net = unit(z.double()), len(versions), embedding_of(estimator)
     courses = Courses(math.inf) if num_steps else COURSES
     if in_a_stack:
@@ -261,9 +233,7 @@ def correct_flow(
 
     def compared_loss(*held_out: Tensor) -> Tensor:
         with seeded(0):  # the loss of a vector field draws random times
-            parts = (one.split(training.training_batch_size, dim=1) for one in held_out)
-            of_each = [mean_loss(*some) for some in zip(*parts, strict=True)]
-        return torch.stack(of_each).mean(dim=0)
+            return mean_loss(*held_out)
 
     histories = fit(
         flow if whole else flow.densities,
@@ -278,7 +248,7 @@ def correct_flow(
         label="Correcting NPE",
         show_progress_bars=show_progress_bars,
     )
-    return Correction(flow, constants, histories)
+    return flow, constants, histories
 
 
 class SimulatedConstants(nn.Module):

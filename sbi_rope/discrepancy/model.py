@@ -1,6 +1,5 @@
 r"""A Bayesian linear model of how real observations differ from simulations."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,7 +12,6 @@ from torch import Tensor
 from sbi_rope.data.pairs import groups_of
 from sbi_rope.discrepancy.posterior import (
     Discrepancy,
-    Judged,
     Regressions,
     independent_pairs,
     log_density_of_right,
@@ -24,12 +22,11 @@ from sbi_rope.utils.settings import Settings, UnitInterval
 from sbi_rope.utils.tensors import as_batch
 
 # Ratios of the variance between groups to the one within them, and their prior. Those
-# below .2 matter for large groups only; together they are as probable as another one.
+# below .2 matter for large groups only.
 VARIANCE_RATIOS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 PRIOR_OF_RATIOS = (1 / 30,) * 5 + (1 / 6,) * 5
-# Chains that are run side by side. Their first imputations depend on the start. Those
-# that are kept are so far apart that they are nearly independent for labels as noisy as
-# the prior is wide.
+# Chains that are run side by side. The imputations that are kept are so far apart that
+# they are nearly independent for labels as noisy as the prior is wide.
 NUM_CHAINS, NUM_WARM_UP, NUM_KEPT, APART = 10, 100, 2, 30
 # Numbers in the largest tensor, unless one chain needs more.
 MAX_ENTRIES = 2**22
@@ -60,21 +57,18 @@ class DiscrepancyModel(Settings):
 
     so that posterior and evidence have closed forms. The shape V is I, or :math:`D^2`
     with the noise of simulations in each entry, relative to the largest: a precise
-    entry may have a smaller error, too. The noise in K keeps what is uncertain about A
-    from adding more than a quarter of :math:`\Sigma` to the noise. V and the
-    hyper-parameters k, s and :math:`\nu` are averaged over a grid, weighted by their
-    evidence, so that there is nothing to choose.
+    entry may have a smaller error, too. V and the hyper-parameters k, s and
+    :math:`\nu` are averaged over a grid, weighted by their evidence, so that there is
+    nothing to choose.
 
     Recordings of one person or specimen can have errors in common. If these have the
     correlation :math:`\rho`, a group of k pairs counts as
     :math:`k / (1 + (k - 1)\, \rho)` independent ones (Kish's design effect), with the
-    mean of :math:`\rho` over a grid, weighted by the evidence. The covariance of the
-    errors is that of all pairs, because a person can be unusual in some entries only.
+    mean of :math:`\rho` over a grid, weighted by the evidence.
 
     The average contains the model :math:`z_i \mid \theta_i \sim \mathcal N(m_i, C)`, in
     which the simulator is right. If it is, the probability of this model goes to one
-    with more pairs, and nothing is corrected, unless the noise of the simulator varies
-    by a factor of several with the parameters. ``DiscrepancyNPE`` and stacks set
+    with more pairs, and nothing is corrected. ``DiscrepancyNPE`` and stacks set
     the probability to zero if the pairs refute the simulator by themselves.
 
     All quantities are in standard deviations of simulations from the prior.
@@ -112,7 +106,6 @@ class DiscrepancyModel(Settings):
         *,
         weights: Tensor | None = None,
         groups: Tensor | None = None,
-        seed: int = 0,
     ) -> Discrepancy:
         r"""Return the posterior of the discrepancy given calibration pairs, in float64.
 
@@ -134,10 +127,8 @@ class DiscrepancyModel(Settings):
                 the pairs, shape ``(l, l)``.
             weights: How many pairs each pair counts as, shape ``(n,)``; one if None.
             groups: A number for each pair, shape ``(n,)``. Pairs with the same number,
-                such as recordings of one person, can have errors in common. None if all
-                are independent. Do not divide the weights by the number of recordings
-                as well: a group counts as fewer pairs anyway.
-            seed: Seed of the imputations.
+                such as recordings of one person, can have errors in common, and count
+                as fewer. None if all are independent.
         """
         width, possible = np.shape(z)[-1:], np.shape(mean)[1:-1][:1]
         z = as_batch("z", z, width).double()
@@ -149,9 +140,7 @@ class DiscrepancyModel(Settings):
         if groups is not None:
             groups = groups_of(as_batch("groups", groups, (), rows=len(z))).to(z.device)
             groups = None if len(groups.unique()) == len(z) else groups
-        once = weights
-        if groups is not None:
-            once = independent_pairs(groups, 1.0, weights)
+        once = weights if groups is None else independent_pairs(groups, 1.0, weights)
         precisions = z.new_tensor(self.gain_precisions)
         grids = z.new_tensor(self.error_scales), z.new_tensor(self.degrees_of_freedom)
         settings = torch.cartesian_prod(*grids)
@@ -174,30 +163,29 @@ class DiscrepancyModel(Settings):
             shares = (torch.stack(evidence, dim=1) + log_prior).softmax(dim=1)
             return independent_pairs(groups, shares @ correlations, weights)
 
-        def posterior(mean: Tensor, weights: Tensor) -> tuple[Regressions, Judged]:
+        def posterior(mean: Tensor, weights: Tensor) -> tuple[Regressions, Tensor]:
+            """Return regressions, and the probability that the simulator is right."""
             found = judged = regress(mean, weights, precisions)
             if groups is not None:
                 # Whether the simulator is right is judged with each group as one pair.
                 # With a correlation that is too low, a right one would be refuted.
                 judged = regress(mean, once, precisions)
-            evidence = judged.log_evidence
-            off = evidence.logsumexp(dim=(1, 2)) - math.log(evidence[0].numel())
             right = log_density_of_right(z - mean, noise, once)
-            prior = torch.logit(off.new_tensor(self.probability_of_none))
-            return found, Judged(off, right, torch.sigmoid(right - off + prior))
+            prior = torch.logit(right.new_tensor(self.probability_of_none))
+            return found, torch.sigmoid(right - judged.mean_log_evidence() + prior)
 
         if possible and possible != (1,):
-            with seeded(seed):
+            with seeded(0):
                 return impute(z, mean, posterior, counts)
         mean = mean.reshape(1, *z.shape)
-        found, judged = posterior(mean, counts(mean))
-        return found.posteriors(judged)[0]
+        found, none = posterior(mean, counts(mean))
+        return found.posteriors(none)[0]
 
 
 def impute(
     z: Tensor,
     possible: Tensor,
-    posterior: Callable[[Tensor, Tensor], tuple[Regressions, Judged]],
+    posterior: Callable[[Tensor, Tensor], tuple[Regressions, Tensor]],
     counts: Callable[[Tensor], Tensor],
 ) -> Discrepancy:
     r"""Average the posterior over imputed means, by Gibbs sampling in C chains.
@@ -209,10 +197,10 @@ def impute(
     """
     mean = possible.mean(dim=1).expand(NUM_CHAINS, -1, -1)
     weights = counts(mean)
-    found, judged = posterior(mean, weights)
+    found, none = posterior(mean, weights)
     kept: list[Discrepancy] = []
     for number in range(1, NUM_WARM_UP + NUM_KEPT * APART + 1):
-        probabilities = _probabilities(z, possible, *found.draw(judged))
+        probabilities = _probabilities(z, possible, *found.draw(none))
         # Faster than torch.multinomial, which draws a number for each of the means.
         bounds = probabilities.cumsum(dim=-1)
         drawn = torch.rand(bounds.shape[:-1]).to(bounds) * bounds[..., -1]
@@ -220,18 +208,17 @@ def impute(
         mean = possible[torch.arange(len(z)), chosen.clamp_max(possible.shape[1] - 1)]
         if number == NUM_WARM_UP:
             weights = counts(mean)
-        found, judged = posterior(mean, weights)
+        found, none = posterior(mean, weights)
         if number > NUM_WARM_UP and (number - NUM_WARM_UP) % APART == 0:
-            kept.extend(found.posteriors(judged))
+            kept.extend(found.posteriors(none))
     # They are not zero, even if the simulator is right in all of them.
     off = [max(1 - one.probability_of_none, 1e-290) for one in kept]
     shares = torch.cat([p * one.shares for p, one in zip(off, kept, strict=True)])
-    names = "probability_of_none", "log_evidence", "log_evidence_of_none"
+    names = "probability_of_none", "log_evidence"
     return replace(
         kept[0],
         terms=tuple(term for one in kept for term in one.terms),
         shares=shares / shares.sum(),
-        num_independent=fmean(one.num_independent for one in kept),
         **{name: fmean(getattr(one, name) for one in kept) for name in names},
     )
 

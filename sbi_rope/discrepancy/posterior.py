@@ -10,10 +10,7 @@ from torch import Tensor
 from torch.distributions import Chi2, MultivariateNormal
 
 from sbi_rope.utils.seeds import seeded
-from sbi_rope.utils.tensors import as_batch
 
-# Entries of the matrices that simulations are corrected by at a time.
-MAX_ENTRIES = 2**22
 # The smallest noise of an entry, relative to the largest, that is told apart from none.
 SMALLEST_SCALE = 0.01
 # The smallest standard deviations of noise and error, in those of simulations from the
@@ -23,8 +20,7 @@ SMALLEST_ERROR = {"embedding": 0.01, "tuned": 0.01, "input": 0.003}
 # The prior precision of the offset is this share of the precision of the gain.
 OFFSET_PRECISION = 1 / 3
 # The prior precision of the gain is at least this times the noise C of each entry and
-# the number of entries. Otherwise, the noise of imprecise entries leaks into a precise
-# one, along directions in which the means of the pairs do not vary.
+# the number of entries, or the noise of imprecise entries leaks into a precise one.
 LEAST_PRECISION = 4.0
 # Settings with less than this share of the evidence of the best one are left out.
 NEGLIGIBLE = 1e-4
@@ -58,8 +54,8 @@ class Term:
         r"""Draw :math:`A`, :math:`b` and :math:`\Sigma`, ``count`` of each term."""
         *batch, width, _ = self.error_factor.shape
         like = self.error_factor
-        # The Bartlett decomposition: T T' follows a Wishart distribution, so that
-        # L (T T')^-1 L' follows an inverse Wishart distribution with scale L L'.
+        # The Bartlett decomposition: T T' follows a Wishart distribution, and
+        # L (T T')^-1 L' an inverse Wishart distribution with scale L L'.
         degrees = self.degrees[..., None] - torch.arange(width).to(like)
         triangle = torch.randn(count, *batch, width, width).to(like).tril(-1)
         triangle = triangle + torch.diag_embed(Chi2(degrees).sample((count,)).sqrt())
@@ -81,11 +77,7 @@ class Discrepancy:
         shares: The shares of the terms in the evidence, which sum to one.
         noise: The covariance C of simulations at one parameter, shape ``(l, l)``.
         probability_of_none: The probability that the simulator is right.
-        log_evidence: Log density of the pairs under a discrepancy, where each group
-            counts as one pair.
-        log_evidence_of_none: The same if the simulator is right.
-        num_independent: How many independent pairs the calibration pairs count as: the
-            sum of their weights, or less if pairs of a group have errors in common.
+        log_evidence: Log density of the pairs under a discrepancy.
     """
 
     terms: tuple[Term, ...] = field(repr=False)
@@ -93,8 +85,6 @@ class Discrepancy:
     noise: Tensor = field(repr=False)
     probability_of_none: float
     log_evidence: float
-    log_evidence_of_none: float
-    num_independent: float
 
     @torch.no_grad()
     def sample(
@@ -103,14 +93,8 @@ class Discrepancy:
         r"""Draw gains, offsets and errors.
 
         A share ``probability_of_none`` of the draws corrects nothing. In the others the
-        error is without the simulator's own noise,
-        :math:`\Sigma' = \Sigma - A C A^\top`.
-
-        Args:
-            num_draws: Number of draws.
-            smallest_error: The least root of the eigenvalues of
-                :math:`D^{-1} \Sigma' D^{-1}`, see :class:`DiscrepancyModel`.
-            seed: Seed of the draws; None uses torch's state.
+        error is :math:`\Sigma' = \Sigma - A C A^\top`. The eigenvalues of
+        :math:`D^{-1} \Sigma' D^{-1}` have roots of at least ``smallest_error``.
         """
         none, scale = self.probability_of_none, noise_scale(self.noise)
         shares = torch.cat([(1 - none) * self.shares, self.shares.new_tensor([none])])
@@ -150,31 +134,18 @@ class DiscrepancyDraws(NamedTuple):
         return cls(*map(torch.cat, zip(*parts, strict=True)))
 
     def correct(self, z_s: Tensor, draw: Tensor | None = None) -> Tensor:
-        """Return simulations as they would be observed in reality, with own errors.
+        """Return simulations ``(n, l)`` as they would be observed, in float64.
 
-        Args:
-            z_s: Simulations, shape ``(n, l)``.
-            draw: The number of the draw for each, shape ``(n,)``, or for each of m
-                blocks of ``n / m`` simulations, ``(m,)``; random if None.
-
-        Returns:
-            Shape ``(n, l)``, float64.
+        ``draw`` is the number of the draw for each, ``(n,)``, or for each of m blocks
+        of ``n / m`` simulations, ``(m,)``; random if None.
         """
-        z_s = as_batch("z_s", z_s, self.offset.shape[1:]).double()
+        z_s = z_s.double()
         if draw is None:
             draw = torch.randint(len(self.offset), (len(z_s),)).to(z_s.device)
         noise = torch.randn(z_s.shape, dtype=torch.double).to(z_s)
-        blocks = (one.reshape(len(draw), -1, z_s.shape[1]) for one in (z_s, noise))
-        # A matrix for each draw needs a lot of memory if z has many entries.
-        size = max(1, MAX_ENTRIES // z_s.shape[1] ** 2)
-        parts = zip(draw.split(size), *(one.split(size) for one in blocks), strict=True)
-        corrected = [
-            self.offset[which][:, None]
-            + z @ self.gain[which].mT
-            + standard @ self.error_factor[which].mT
-            for which, z, standard in parts
-        ]
-        return torch.cat(corrected).reshape_as(z_s)
+        z, noise = (one.reshape(len(draw), -1, z_s.shape[1]) for one in (z_s, noise))
+        moved = self.offset[draw][:, None] + z @ self.gain[draw].mT
+        return (moved + noise @ self.error_factor[draw].mT).reshape_as(z_s)
 
 
 def decorrelated(
@@ -206,14 +177,6 @@ def independent_pairs(
     number = groups.bincount(weights=w).square() / groups.bincount(weights=w.square())
     correlation = torch.as_tensor(correlation).to(w)[..., None]
     return w / (1 + (number[groups] - 1) * correlation)
-
-
-class Judged(NamedTuple):
-    """Whether the simulator is right, given each of B sets of means, ``(B,)``."""
-
-    off: Tensor  # the log density of the pairs under a discrepancy
-    right: Tensor  # that if the simulator is right
-    probability_of_none: Tensor
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -325,7 +288,12 @@ class Regressions:
             degrees=strength + scale.shape[-1] + 1 + self.num_pairs[b],
         )
 
-    def posteriors(self, judged: Judged) -> list[Discrepancy]:
+    def mean_log_evidence(self) -> Tensor:
+        """Return the log of the mean evidence of all priors, ``(B,)``."""
+        count = self.log_evidence[0].numel()
+        return self.log_evidence.logsumexp(dim=(1, 2)) - math.log(count)
+
+    def posteriors(self, probability_of_none: Tensor) -> list[Discrepancy]:
         """Return for each set the average over settings with evidence for them."""
         found = []
         for b, evidence in enumerate(self.log_evidence):
@@ -334,22 +302,20 @@ class Regressions:
                 terms=tuple(self.at(b, k, s) for k, s in kept.nonzero().tolist()),
                 shares=torch.softmax(evidence[kept], dim=0),
                 noise=self.noise,
-                probability_of_none=float(judged.probability_of_none[b]),
-                log_evidence=float(judged.off[b]),
-                log_evidence_of_none=float(judged.right[b]),
-                num_independent=float(self.num_pairs[b]),
+                probability_of_none=float(probability_of_none[b]),
+                log_evidence=float(self.mean_log_evidence()[b]),
             )
             found.append(one)
         return found
 
-    def draw(self, judged: Judged) -> tuple[Tensor, Tensor, Tensor]:
+    def draw(self, probability_of_none: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Draw a gain, an offset and the covariance of z given theta for each set."""
         probabilities = self.log_evidence.flatten(1).softmax(dim=1)
         chosen = torch.multinomial(probabilities, 1)[:, 0]
         b, count = torch.arange(len(chosen), device=chosen.device), len(self.settings)
         drawn = self.at(b, chosen // count, chosen % count).sample(1)
         gain, offset, covariance = (values[0] for values in drawn)
-        none = torch.rand(len(chosen)).to(gain) < judged.probability_of_none
+        none = torch.rand(len(chosen)).to(gain) < probability_of_none
         none, identity = none[:, None, None], torch.eye(len(self.noise)).to(gain)
         return (
             torch.where(none, identity, gain),

@@ -3,22 +3,15 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from scipy.stats import t
 from torch import Tensor
 
 from sbi_rope.data.simulate import Moments
+from sbi_rope.discrepancy.correction import in_units
 from sbi_rope.discrepancy.model import DiscrepancyModel
-from sbi_rope.discrepancy.posterior import Discrepancy
 from sbi_rope.npe.standardisation import Standardisation
 from sbi_rope.utils.errors import InvalidInputError
 
 NUM_DRAWS = 4000
-# The probability that a summary without outliers is reported to have one.
-FALSE_ALARMS = 0.01
-# The efficiency of a standard deviation that is estimated from a median distance.
-EFFICIENCY = 0.37
-# With fewer pairs one cannot tell which of them is the outlier.
-MIN_PAIRS_FOR_OUTLIERS = 10
 
 
 @dataclass(frozen=True)
@@ -56,8 +49,6 @@ class SummaryDiscrepancy:
             :math:`E[(b + (a - 1)(x_s - \bar x))^2] + s^2`, in units of ``std``.
         probability_of_none: The probability that the simulator is right about this
             summary, with one half before any pair is seen.
-        outliers: Rows of calibration pairs that do not fit the others. In 99 of 100
-            summaries without outliers no pair is so far away by chance.
         std: The standard deviation of simulations from the prior, in the units of x.
     """
 
@@ -68,7 +59,6 @@ class SummaryDiscrepancy:
     size: Interval
     probability_of_none: float
     std: float
-    outliers: tuple[int, ...] = ()
 
     @property
     def is_off(self) -> bool:
@@ -80,8 +70,7 @@ class SummaryDiscrepancy:
 class DiscrepancyReport:
     """The discrepancy of each summary, as estimated from calibration pairs.
 
-    Print it, draw it with :func:`sbi_rope.plots.discrepancy`, or make a table of
-    ``dataclasses.asdict(summary)`` for each of its summaries.
+    Print it, or draw it with :func:`sbi_rope.plots.discrepancy`.
 
     Attributes:
         summaries: The discrepancy of each summary, from the largest to the smallest.
@@ -113,22 +102,6 @@ class DiscrepancyReport:
             constant=tuple(of_entry[name] for name in self.constant),
         )
 
-    @property
-    def notes(self) -> list[str]:
-        """Sentences about constant summaries and outliers."""
-        notes = []
-        if self.constant:
-            notes.append(f"The same in all simulations: {', '.join(self.constant)}.")
-        outliers = sorted((row, s.name) for s in self.summaries for row in s.outliers)
-        if outliers:
-            listed = ", ".join(f"row {row} ({name})" for row, name in outliers)
-            notes.append(
-                f"Pairs that do not fit the others: {listed}. Look whether a label or "
-                "a measurement is wrong. If they are many, reality is rather not "
-                "linear in the simulation there."
-            )
-        return notes
-
     def __str__(self) -> str:
         grouped = self.num_groups < self.num_pairs
         in_groups = f" in {self.num_groups} groups" if grouped else ""
@@ -150,7 +123,9 @@ class DiscrepancyReport:
             lines += ["  " + "  ".join(row).rstrip() for row in cells]
         if fine:
             lines.append(f"  no sign of discrepancy: {', '.join(fine)}")
-        return "\n".join([*lines, *(f"  {note}" for note in self.notes)])
+        if self.constant:
+            lines.append(f"  The same in all simulations: {', '.join(self.constant)}.")
+        return "\n".join(lines)
 
 
 def report_discrepancy(
@@ -168,61 +143,34 @@ def report_discrepancy(
     light, is ambiguous. The gain of a single summary is not, and can be checked.
     """
     unit = Standardisation(simulated.double())
-    varying, summaries = unit.varies.nonzero()[:, 0].tolist(), []
-    if not varying:
-        raise InvalidInputError(
-            "Expected simulations that differ from each other; all summaries are "
-            "constant."
+    varying, constant = ((unit.varies == value).nonzero()[:, 0] for value in (1, 0))
+    z, expected, summaries = unit(x.double()), in_units(moments, unit), []
+    for k, j in enumerate(varying.tolist()):
+        noise = expected.covariance[:, k, k].mean().reshape(1, 1)
+        mean = expected.means[..., [k]]
+        found = model.fit(z[:, [k]], mean, noise, weights=weights, groups=groups)
+        # Intervals assume that there is a discrepancy, whose probability is beside.
+        draws = replace(found, probability_of_none=0.0).sample(
+            NUM_DRAWS, smallest_error=0.0, seed=0
         )
-    for j in varying:
-        mean, std = unit.mean[j], unit.std[j]
-        z = ((x[:, j].double() - mean) / std)[:, None]
-        m = ((moments.means[..., j] - mean) / std)[..., None]
-        noise = moments.covariance[:, j, j].mean() / std.square()
-        found = model.fit(z, m, noise.reshape(1, 1), weights=weights, groups=groups)
-        summaries.append(_summary(f"x[{j}]", found, z, m, scale=float(std)))
+        gain, shift = draws.gain[:, 0, 0], draws.offset[:, 0]
+        error, std = draws.error_factor[:, 0, 0].abs(), float(unit.std[j])
+        size = ((gain - 1).square() + shift.square() + error.square()).sqrt()
+        summaries.append(
+            SummaryDiscrepancy(
+                name=f"x[{j}]",
+                gain=Interval.of(gain),
+                shift=Interval.of(shift * std),
+                error=Interval.of(error * std),
+                size=Interval.of(size),
+                probability_of_none=found.probability_of_none,
+                std=std,
+            )
+        )
     summaries.sort(key=lambda s: (not s.is_off, -s.size.median))
-    constant = (~unit.varies).nonzero()[:, 0].tolist()
     return DiscrepancyReport(
         summaries=tuple(summaries),
         num_pairs=len(x),
         num_groups=len(x) if groups is None else len(groups.unique()),
-        constant=tuple(f"x[{j}]" for j in constant),
-    )
-
-
-def _summary(
-    name: str, discrepancy: Discrepancy, z: Tensor, mean: Tensor, *, scale: float
-) -> SummaryDiscrepancy:
-    """Return the discrepancy of a summary, with z ``(n, 1)`` and mean ``(n, R, 1)``."""
-    # The intervals assume that there is a discrepancy. Its probability is reported too.
-    draws = replace(discrepancy, probability_of_none=0.0).sample(
-        NUM_DRAWS, smallest_error=0.0, seed=0
-    )
-    gain, shift = draws.gain[:, 0, 0], draws.offset[:, 0]
-    error = draws.error_factor[:, 0, 0].abs()
-    size = ((gain - 1).square() + shift.square() + error.square()).sqrt()
-    outliers: tuple[int, ...] = ()
-    n, num_means = mean.shape[:2]
-    # Of several means, a residual may come from the label.
-    if num_means == 1 and n >= MIN_PAIRS_FOR_OUTLIERS:
-        residual = (z - gain.median() * mean[:, 0] - shift.median())[:, 0]
-        distance = (residual - residual.median()).abs()
-        noise = float(gain.median().abs() * discrepancy.noise[0, 0].sqrt())
-        # The median distance of a normal variable from its median is 0.6745 standard
-        # deviations.
-        std = (distance.median() / 0.6745).clamp_min(noise)
-        # The furthest of n values exceeds this quantile with a probability of 1 %. The
-        # standard deviation is an estimate, hence Student's t.
-        furthest = float(t.isf(FALSE_ALARMS / (2 * n), EFFICIENCY * (n - 1)))
-        outliers = tuple((distance > furthest * std).nonzero().flatten().tolist())
-    return SummaryDiscrepancy(
-        name=name,
-        gain=Interval.of(gain),
-        shift=Interval.of(shift * scale),
-        error=Interval.of(error * scale),
-        size=Interval.of(size),
-        probability_of_none=discrepancy.probability_of_none,
-        outliers=outliers,
-        std=scale,
+        constant=tuple(f"x[{j}]" for j in constant.tolist()),
     )

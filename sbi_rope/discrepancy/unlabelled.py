@@ -22,7 +22,6 @@ NUM_COMPONENTS, NUM_FITTED = 25, 8000
 # Prior standard deviations of the offset, and of the diagonal and the other entries of
 # the gain. Centre of those of the error, whose logarithms have standard deviation one.
 OFFSET, DIAGONAL, OFF_DIAGONAL, ERROR = 0.3, 0.3, 0.1, 0.3
-# The search for the mode.
 SEARCH = Training(learning_rate=3e-2, max_num_epochs=200)
 # Steps of Newton's method, and the distance of gradients whose difference is taken.
 NUM_HESSIANS, NUM_NEWTON, NUM_HALVINGS, STEP = 2, 5, 6, 1e-4

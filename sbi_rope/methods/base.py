@@ -3,6 +3,7 @@ r"""What all methods have in common: data goes in, a posterior of sbi comes out.
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar, Literal
 
@@ -39,50 +40,34 @@ Kind = Literal["simulations", "calibration", "observations"]
 KINDS: tuple[Kind, ...] = ("observations", "calibration", "simulations")
 
 
+@dataclass
 class Data:
-    """What was appended, in float32, with x of one shape."""
+    """What was appended, in float32: theta ``(n, d)`` and x ``(n, *event)``."""
 
-    def __init__(self) -> None:
-        self.tensors: dict[Kind, Any] = {}
-
-    @property
-    def simulations(self) -> tuple[Tensor, Tensor]:
-        """Theta ``(n, d)`` and simulated x ``(n, *event)``."""
-        return self.tensors["simulations"]
-
-    @property
-    def calibration(self) -> tuple[Tensor, Tensor]:
-        """Theta ``(n, d)`` and the real x ``(n, *event)`` recorded at them."""
-        return self.tensors["calibration"]
+    simulations: Any = ()
+    calibration: Any = ()
+    observations: Any = ()  # x alone
 
     @property
     def pairs(self) -> Pairs:
         """The calibration pairs, whose labels are exact."""
         return Pairs.exact(*self.calibration)
 
-    @property
-    def observations(self) -> Tensor:
-        """Real x without parameters, ``(n_o, *event)``."""
-        return self.tensors["observations"][0]
-
 
 class Method(ABC):
     """A method of inference: construct, append data, ``train``, ``build_posterior``.
 
     What is passed in is copied or only read. Appending data after a training asks for
-    another one, which starts anew. ``train`` and what appends return the method, so
-    that calls can be chained. Of data that do not fit nothing is added.
+    another one, which starts anew. Of data that do not fit nothing is added.
 
     A subclass says which data it ``sees`` and returns a posterior from ``_fit``.
-    Options that a method has no use for raise a ``TypeError``.
 
     Attributes:
         sees: The kinds of data that can be appended.
         starts_from_npe: Whether it starts from NPE, see ``from_posterior``.
         trains_on_statistics: Whether it trains on statistics of simulations, so that it
             needs simulations also beside a trained NPE.
-        simulates: Whether it makes simulations of its own. Without a simulator it looks
-            them up among those that were appended.
+        simulates: Whether it makes simulations of its own.
         min_pairs: The number of calibration pairs that it needs, if it sees them.
         default_training: How its own networks are trained; None if it has none.
 
@@ -95,13 +80,12 @@ class Method(ABC):
         training: How the networks of the method itself are trained; its
             ``default_training`` if None.
         simulator: Maps parameters to simulations, batched or not, for a method that
-            simulates. Without one, appended simulations take its place; those at given
-            parameters are the ones with the nearest parameters.
+            simulates. Without one, appended simulations take its place.
         device: Where to train; data on other devices is moved there.
 
     Raises:
         UnsupportedPosteriorError: In ``train``, if the method needs a density and the
-            estimator has none, or if its embedding cannot be separated.
+            estimator has none.
     """
 
     sees: ClassVar[frozenset[Kind]]
@@ -147,19 +131,11 @@ class Method(ABC):
         self._history: History | None = None
 
     @classmethod
-    def from_posterior(
-        cls,
-        posterior: Any,
-        *,
-        simulations: tuple[Tensor, Tensor] | None = None,
-        **options: Any,
-    ) -> Self:
+    def from_posterior(cls, posterior: Any, **options: Any) -> Self:
         """Start from a trained NPE instead of training one.
 
         Args:
-            posterior: What ``NPE(...).build_posterior()`` of sbi returns. It is copied
-                and never changed.
-            simulations: Pairs (theta, x) to append, with theta drawn from the prior.
+            posterior: What ``NPE(...).build_posterior()`` returns, which is copied.
             **options: Keyword arguments of the constructor, except for ``device`` and
                 what concerns the training of NPE.
 
@@ -178,8 +154,6 @@ class Method(ABC):
         method._theta_names = getattr(posterior, "parameter_names", None)
         method._x_names = getattr(posterior, "x_names", None)
         method._embedding_net = copy.deepcopy(embedding_of(estimator))
-        if simulations is not None:
-            method.append_simulations(*simulations)
         return method
 
     def append_simulations(self, theta: Tensor, x: Tensor) -> Self:
@@ -320,10 +294,10 @@ class Method(ABC):
                 f"Expected `{name}` to be finite; got NaN or Inf in "
                 f"{rows_with(~valid)}."
             )
-        old = self._data.tensors.get(kind, [one[:0] for one in new])
-        self._data.tensors[kind] = tuple(
-            torch.cat([one, more[valid]]) for one, more in zip(old, new, strict=True)
-        )
+        new = tuple(one[valid] for one in new)
+        if old := getattr(self._data, kind):
+            new = tuple(map(torch.cat, zip(old, new, strict=True)))
+        setattr(self._data, kind, new)
         self._event_shape = read.shape[1:]
         self._theta_names = self._theta_names or column_names(theta)
         self._x_names = self._x_names or column_names(x)
@@ -336,12 +310,12 @@ class Method(ABC):
         read = as_batch("theta", theta, shape, names=self._theta_names)
         return read.to(self._device, torch.float32, copy=True)
 
-    def _check_data(self, *kinds: Kind) -> None:
-        """Raise unless there are the data of these kinds, or of all, that it needs."""
-        for kind in kinds or KINDS:
+    def _check_data(self) -> None:
+        """Raise unless there are all data that it needs."""
+        for kind in KINDS:
             is_needed = self.needs_simulations if kind == "simulations" else True
             least = self.min_pairs if kind == "calibration" else 1
-            count = len(self._data.tensors.get(kind, [()])[0])
+            count = len((getattr(self._data, kind) or [()])[0])
             if is_needed and kind in self.sees and count < least:
                 raise NotReadyError(
                     f"{type(self).__name__} needs at least {least} rows of "

@@ -46,10 +46,6 @@ class DiscrepancyNPE(Method):
     ``docs/background/discrepancy.md`` says when it fails. FMPE and NPSE posteriors can
     be corrected too.
 
-    References:
-        | Bayesian Calibration of Computer Models (Kennedy and O'Hagan, 2001)
-        | https://doi.org/10.1111/1467-9868.00294
-
     Args:
         prior, density_estimator, npe_training, simulator, device: See ``Method``.
         space: What is corrected, see above.
@@ -80,7 +76,6 @@ class DiscrepancyNPE(Method):
         **options: Any,
     ) -> None:
         check("space", space, Corrected)
-        check("learn_prior", learn_prior, bool)
         check("model", model, DiscrepancyModel | None)
         check("num_simulations", num_simulations, Annotated[int, Range(2)])
         check("num_steps", num_steps, Count | None)
@@ -108,23 +103,18 @@ class DiscrepancyNPE(Method):
     ) -> DiscrepancyReport:
         """Compare simulations with real observations, summary by summary.
 
-        The method need not be trained, and with a simulator it needs no appended
-        simulations. The report is about x itself, whatever ``space`` is.
+        The method need not be trained. The report is about x itself, whatever
+        ``space`` is.
 
         Args:
             summaries: A function from observations ``(n, *event)`` to a few summaries
                 of each, ``(n, k)``, such as the means of parts of an image. It may
                 return a NumPy array. If None, they are the entries of a vector x.
             x_names: Names of the summaries; numbered if None.
-            seed: Seed of the simulations, as in ``train``.
+            seed: As in ``train``.
             show_progress_bars: As in ``train``.
-
-        Returns:
-            The gain, shift and error of each summary with 95 % intervals.
         """
-        self._check_data("calibration")
-        if self._simulator is None:
-            self._check_data("simulations")
+        self._check_data()
         pairs, show = self._data.pairs, is_shown(show_progress_bars)
         if pairs.x.ndim != 2 and summaries is None:
             raise InvalidInputError(
@@ -157,27 +147,18 @@ class DiscrepancyNPE(Method):
         npe, _ = self._trained_npe(show_progress_bars=show)
         estimator, source = estimator_of(npe), self._source()
         warn_of_far_entries("x", pairs.x, embedding_of(estimator))
-        net = network_of(estimator, self.space)
-        found = moments(
-            source, pairs, SIMULATIONS_PER_PAIR, partial(embed, net), progress=show
-        )
-        theta_s, x_s = self._data.tensors.get("simulations") or source.from_prior(
+        h = partial(embed, network_of(estimator, self.space))
+        found = moments(source, pairs, SIMULATIONS_PER_PAIR, h, progress=show)
+        theta_s, x_s = self._data.simulations or source.from_prior(
             self.num_simulations, seed=0, progress=show
         )
-        if self.space == "input":
-            as_batch("x", pairs.x)
-            as_batch("x of simulations", x_s)
-        simulations = theta_s, embed(net, x_s)
+        simulations = theta_s, as_batch("x of simulations", h(x_s))
+        z, learn_prior = as_batch("x", h(pairs.x)), self.learn_prior
         version = fit_version(
-            pairs,
-            embed(net, pairs.x),
-            found,
-            simulations,
-            self.model,
-            learn_prior=self.learn_prior,
+            pairs, z, found, simulations, self.model, learn_prior=learn_prior
         )
         self._discrepancy, _ = version
-        correction = correct_flow(
+        flow, _, [history] = correct_flow(
             estimator,
             simulations,
             [version],
@@ -185,5 +166,4 @@ class DiscrepancyNPE(Method):
             num_steps=self.num_steps,
             show_progress_bars=show,
         )
-        corrected = posterior_from(npe, correction.flow.estimator(estimator))
-        return corrected, correction.histories[0]
+        return posterior_from(npe, flow.estimator(estimator)), history

@@ -3,7 +3,6 @@
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from sbi_rope.data.pairs import (
     MIN_PAIRS_FOR_HOLDOUT,
@@ -51,9 +50,8 @@ class FinetunedNPE(Method):
     Args:
         prior, density_estimator, npe_training, device: See ``Method``.
         num_holdouts: How often it is tuned. With one, ``validation_fraction`` of the
-            pairs are held out. With K, the pairs are cut into K parts (at most as many
-            as there are groups) and each is held out once. With fewer than five groups
-            none is held out, and it is tuned once.
+            pairs are held out. With K, the pairs are cut into K parts and each is held
+            out once. With fewer than five groups none is held out.
         learning_rates: Each is tried from the start; the smallest is taken if there are
             too few pairs to hold some out.
         training: How it is tuned, apart from the learning rate; at most 500 epochs in
@@ -61,9 +59,6 @@ class FinetunedNPE(Method):
 
     Attributes:
         histories: The losses of the last training, of each network.
-
-    Raises:
-        UnsupportedPosteriorError: In ``train``, if the estimator has no density.
     """
 
     sees = frozenset({"simulations", "calibration"})
@@ -86,11 +81,17 @@ class FinetunedNPE(Method):
 
     def _fit(self, *, show_progress_bars: bool) -> tuple[Any, History]:
         npe, _ = self._trained_npe(show_progress_bars=show_progress_bars)
-        start = check_density(estimator_of(npe))
+        start, pairs = check_density(estimator_of(npe)), self._data.pairs
         theta, x = self._data.calibration
         warn_of_far_entries("x", x, embedding_of(start))
-        splits, rates = self._splits(), self.learning_rates
-        held_out = splits[0][1]
+        if self.num_holdouts == 1 or pairs.num_groups < MIN_PAIRS_FOR_HOLDOUT:
+            parts = split_pairs(pairs.group, self.training.validation_fraction)
+            splits = [(parts[0].to(pairs.group), parts[1].to(pairs.group))]
+        else:
+            every = torch.arange(len(pairs)).to(pairs.group)
+            folds = pairs.folds(self.num_holdouts)
+            splits = [(every[~torch.isin(every, rows)], rows) for rows in folds]
+        held_out, rates = splits[0][1], self.learning_rates
         if not len(held_out):
             rates = (min(rates),)
         jobs = [split for split in splits for _ in rates]
@@ -114,13 +115,3 @@ class FinetunedNPE(Method):
         else:
             tuned = MixturePosterior(flow[best], self._prior)
         return tuned, self.histories[0]
-
-    def _splits(self) -> list[tuple[Tensor, Tensor]]:
-        """Return the rows to train on and those held out, for each network."""
-        pairs = self._data.pairs
-        if self.num_holdouts == 1 or pairs.num_groups < MIN_PAIRS_FOR_HOLDOUT:
-            parts = split_pairs(pairs.group, self.training.validation_fraction)
-            return [(parts[0].to(pairs.group), parts[1].to(pairs.group))]
-        every = torch.arange(len(pairs)).to(pairs.group)
-        folds = pairs.folds(self.num_holdouts)
-        return [(every[~torch.isin(every, rows)], rows) for rows in folds]

@@ -1,7 +1,6 @@
 """Fine-tuning on real observations with known parameters, of a net and of NPE."""
 
 import copy
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -66,8 +65,6 @@ class CalibrationFinetuner(Settings):
         simulations_per_target: The number of simulations in the mean that estimates
             each expectation. With 1, as in the paper, g is pulled towards the noise of
             single simulations.
-        resample_targets: Whether to draw new simulations in every epoch, as the paper
-            does, instead of once before the first.
         validation_fraction: The share of the pairs that is held out, at most 0.5.
         rehearsal: :math:`\lambda`, not negative. The default is 0, as in the paper.
     """
@@ -76,7 +73,6 @@ class CalibrationFinetuner(Settings):
     max_num_epochs: Count = 1000
     stop_after_epochs: Count = 200
     simulations_per_target: Count = 100
-    resample_targets: bool = False
     validation_fraction: Annotated[float, Range(0, 0.5)] = 0.2
     rehearsal: NotNegative = 0.0
 
@@ -90,18 +86,14 @@ class CalibrationFinetuner(Settings):
         groups: Tensor,
         weights: Tensor | None = None,
         draw_simulations: Callable[[int], Tensor],
-        draw_targets: Callable[[], Tensor] | None = None,
         show_progress_bars: bool = False,
     ) -> tuple[Ensemble, list[History]]:
         """Tune a copy of h on each of several sets of pairs, all at once.
 
         Of each copy, ``targets`` has the targets at all pairs, shape ``(n_c, l)``, and
-        ``sets`` the rows of the pairs x, ``(n_c, *event)``, that it may see. Of
-        ``groups`` and ``weights`` there is a number for each pair, ``(n_c,)``; a group
-        is held out as a whole. For ``rehearsal``, ``draw_simulations`` returns up to k
-        simulations from the prior, ``(k, *event)``; for ``resample_targets``,
-        ``draw_targets`` returns new targets for every epoch after the first. Return the
-        tuned nets, in evaluation mode, and the course of each training.
+        ``sets`` the rows of the pairs x, ``(n_c, *event)``, that it may see. There is a
+        group and a weight of each pair, ``(n_c,)``. ``draw_simulations`` returns up to
+        k simulations from the prior, ``(k, *event)``. Return the nets and their losses.
         """
         splits = []
         for rows in sets:
@@ -119,10 +111,10 @@ class CalibrationFinetuner(Settings):
         train, held_out = (
             side_by_side(rows, weights) for rows in zip(*every, strict=True)
         )
-        fixed = torch.stack([one for one in targets for _ in rates])
+        aims = torch.stack([one for one in targets for _ in rates])
         net = trainable_copy(h, targets[0])
         nets = Ensemble([net] * len(every), embedded, (x[:3],))
-        kept = None
+        kept: tuple[Tensor, ...] = ()
         if self.rehearsal:
             x_s = draw_simulations(NUM_REHEARSED).to(x.dtype)
             kept = x_s, embed(h, x_s)
@@ -136,19 +128,16 @@ class CalibrationFinetuner(Settings):
             return weighted_mean(distances(x[index], own), share)
 
         def batches(epoch: int) -> list[tuple[Tensor, ...]]:
-            new = draw_targets() if draw_targets and epoch else fixed
-            batch = *train, new.expand_as(fixed)
-            if kept is None:
-                return [batch]
+            if not kept:
+                return [(*train, aims)]
             some = torch.randint(len(kept[0]), (len(every), REHEARSED_IN_EPOCH))
-            some = some.to(x.device)
-            return [(*batch, kept[0][some], kept[1][some])]
+            return [(*train, aims, *(one[some.to(x.device)] for one in kept))]
 
-        def loss(*batch: Tensor) -> Tensor:
-            found = distance(*batch[:3])
-            if kept is None:
-                return found
-            return found + self.rehearsal * distances(*batch[3:]).mean(dim=1)
+        def loss(index: Tensor, share: Tensor, aims: Tensor, *kept: Tensor) -> Tensor:
+            found = distance(index, share, aims)
+            if kept:
+                found = found + self.rehearsal * distances(*kept).mean(dim=1)
+            return found
 
         histories = fit(
             nets,
@@ -156,7 +145,7 @@ class CalibrationFinetuner(Settings):
             loss,
             Training(stop_after_epochs=self.stop_after_epochs, clip_max_norm=None),
             validation_loss=distance if len(fewest) else None,
-            held_out=(*held_out, fixed),
+            held_out=(*held_out, aims),
             learning_rates=rates * len(sets),
             max_num_epochs=max_num_epochs,
             in_training_mode=False,
@@ -228,15 +217,13 @@ def finetune_flow(
 
     def losses(rows: Tensor, member: Tensor) -> Tensor:
         """Return the negative log densities of labels, ``(E, B)`` to ``(E, B)``."""
-        nodes, of_nodes = theta[member, rows], log_weights[member, rows]
+        nodes = theta[member, rows]
         z = flow.embeddings(x[rows]) if fixed is None else fixed[rows]
-        count = nodes.shape[2]
-        log_q = -flow.losses_given(
-            nodes.flatten(1, 2), z.repeat_interleave(count, dim=1)
-        )
-        log_q = log_q.unflatten(1, (-1, count)).double()
-        terms = torch.where(torch.isneginf(of_nodes), of_nodes, log_q + of_nodes)
-        return math.log(count) - terms.logsumexp(dim=2)
+        z = z.repeat_interleave(nodes.shape[2], dim=1)
+        log_q = -flow.losses_given(nodes.flatten(1, 2), z).reshape(-1, nodes.shape[2])
+        of_nodes = log_weights[member, rows].flatten(0, 1)
+        flat = Nodes(theta=nodes.flatten(0, 1), log_weights=of_nodes)
+        return -flat.log_mean(log_q).reshape(rows.shape)
 
     train, held_out = (
         side_by_side(_with_density(partial(losses, member=member), rows), weights)
@@ -333,8 +320,7 @@ def trainable_copy(embedding_net: nn.Module, embeddings: Tensor) -> nn.Module:
     if not has_parameters(net):
         width = embeddings.shape[1]
         affine = nn.Linear(width, width).to(embeddings)
-        with torch.no_grad():
-            affine.weight.copy_(torch.eye(width))
-            affine.bias.zero_()
+        nn.init.eye_(affine.weight)
+        nn.init.zeros_(affine.bias)
         net = nn.Sequential(net, affine)
     return net.eval()

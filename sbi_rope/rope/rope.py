@@ -16,7 +16,7 @@ from sbi_rope.data.simulate import Source, moments, source_of, targets
 from sbi_rope.density import Coupled, MixturePosterior
 from sbi_rope.discrepancy.correction import tuning_targets
 from sbi_rope.npe.sbi import TrainedNPE, embed
-from sbi_rope.npe.standardisation import Standardisation, warn_of_far_entries
+from sbi_rope.npe.standardisation import warn_of_far_entries
 from sbi_rope.rope.finetuning import CalibrationFinetuner, History
 from sbi_rope.utils.errors import (
     InvalidInputError,
@@ -27,11 +27,7 @@ from sbi_rope.utils.errors import (
 from sbi_rope.utils.progress import is_shown
 from sbi_rope.utils.seeds import seeded
 from sbi_rope.utils.settings import Count, check
-from sbi_rope.utils.tensors import (
-    as_numbers,
-    column_names,
-    rows_with,
-)
+from sbi_rope.utils.tensors import as_numbers, column_names, rows_with
 
 # The number of simulations to couple with if the batch has fewer observations.
 MIN_SIMULATIONS = 1000
@@ -78,12 +74,10 @@ class RoPE:
             table of parameters, or "theta_1" and so on.
 
     Attributes:
-        npe: A copy of the posterior, in its parts; ``npe.posterior()`` puts them
-            together again.
+        npe: A copy of the posterior, in its parts.
         pairs: The calibration pairs appended so far, with draws of their parameters.
-        source: Where simulations come from; ``source.num_calls`` counts how many rows
-            of theta the simulator has simulated, and ``source.num_dropped`` those that
-            were dropped because of NaN or Inf.
+        source: Where simulations come from; ``num_calls`` counts the rows of theta that
+            were simulated, and ``num_dropped`` those dropped because of NaN or Inf.
 
     Raises:
         UnsupportedPosteriorError: If the posterior has no embedding to work with, or if
@@ -163,9 +157,8 @@ class RoPE:
         Whatever needs the parameters is averaged over :math:`p(\theta \mid y)` under
         the prior.
 
-        Tensors, arrays, tables and lists of numbers are taken. The columns of a table
-        are put into the order of the names that RoPE knows. Rows of theta and x are
-        paired by position, not by their row labels.
+        The columns of a table are put into the order of the names that RoPE knows. Rows
+        of theta and x are paired by position, not by their row labels.
 
         Args:
             theta: Parameters, shape ``(n, d)``, inside the prior's support. NaN stands
@@ -247,33 +240,24 @@ class RoPE:
             )
         pairs, show = self.pairs, is_shown(show_progress_bars)
         source, how, h = self.source, self.finetuner, self._embed
-
-        def draw_targets() -> Tensor:
-            of_pairs = source, pairs, how.simulations_per_target, h
-            if pairs.are_exact:
-                return targets(*of_pairs, progress=show)
-            _, x_s = source.from_prior(MIN_SIMULATIONS, seed=0, progress=show)
-            return tuning_targets(
-                h(pairs.x),
-                moments(*of_pairs, progress=show),
-                Standardisation(h(x_s).double()),
-                weights=pairs.weight,
-                groups=pairs.group,
-            )
-
-        def draw_simulations(n: int) -> Tensor:
-            return source.from_prior(n, seed=0, progress=show)[1]
-
+        of_pairs = source, pairs, how.simulations_per_target, h
         with seeded(seed):
+            if pairs.are_exact:
+                aims = targets(*of_pairs, progress=show)
+            else:
+                _, x_s = source.from_prior(MIN_SIMULATIONS, seed=0, progress=show)
+                found = moments(*of_pairs, progress=show)
+                aims = tuning_targets(pairs, h(pairs.x), found, h(x_s))
             nets, [self._history] = how.tuned(
                 self.npe.h,
                 pairs.x,
-                [draw_targets()],
+                [aims],
                 [torch.arange(len(pairs)).to(pairs.group)],
                 groups=pairs.group,
                 weights=pairs.weight,
-                draw_simulations=draw_simulations,
-                draw_targets=draw_targets if how.resample_targets else None,
+                draw_simulations=lambda n: source.from_prior(n, seed=0, progress=show)[
+                    1
+                ],
                 show_progress_bars=show,
             )
         self._g = nets.member(0)
@@ -319,6 +303,7 @@ class RoPE:
         """Couple a batch of real observations with simulations.
 
         After one training, it can be called for any number of batches and couplers.
+        There is a warning if a coupling has not converged.
 
         Args:
             x_o: The batch, shape ``(n_o, *event)``. Each posterior depends on the whole
@@ -326,12 +311,8 @@ class RoPE:
             coupler: Settings for this batch; those of this object if None.
             num_simulations: n_s; ``max(n_o, 1000)`` if None. Of stored simulations
                 there may be fewer.
-            seed: Seed of the simulations, as in :meth:`train`.
+            seed: As in :meth:`train`.
             show_progress_bars: As in :meth:`train`.
-
-        Returns:
-            The posteriors of the batch. There is a warning if the coupling has not
-            converged.
 
         Raises:
             NotReadyError: If calibration pairs were appended after the last training.
@@ -365,11 +346,6 @@ class RoPE:
         It is an sbi posterior for any x, the paper's ablation "tuning-only".
         """
         return self.npe.posterior(self.tuned_embedding_net)
-
-    @property
-    def embedding_net(self) -> nn.Module:
-        """A copy of h, the embedding net of NPE with sbi's standardising layer."""
-        return copy.deepcopy(self.npe.h)
 
     @property
     def tuned_embedding_net(self) -> nn.Module:

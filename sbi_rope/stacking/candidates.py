@@ -212,7 +212,7 @@ def started(
         )
         for of_rows, rows in zip(z, versions, strict=True)
     ]
-    found = correct_flow(
+    corrected, constants, _ = correct_flow(
         data.estimator,
         simulations,
         fitted,
@@ -221,11 +221,11 @@ def started(
         show_progress_bars=data.show,
     )
     if space == "embedding":
-        flow = found.flow[of_version]
+        flow = corrected[of_version]
     else:
-        nets = nets.then(found.constants) if nets else None
-        of_nets = of_nets or [min(v, len(found.flow.nets) - 1) for v in of_version]
-        flow = found.flow.made_of([*zip(of_nets, of_version, strict=True)], nets)
+        nets = nets.then(constants) if nets else None
+        of_nets = of_nets or [min(v, len(corrected.nets) - 1) for v in of_version]
+        flow = corrected.made_of([*zip(of_nets, of_version, strict=True)], nets)
     data.kept[key] = flow
     return flow, numbers
 
@@ -377,14 +377,14 @@ class UnlabelledCandidate(Candidate):
             Marginal.of(unit(x_s.double())),
             show_progress_bars=data.show,
         )
-        flow = correct_flow(
+        flow, _, _ = correct_flow(
             data.estimator,
             data.simulations,
             [(one, None) for one in found],
             space="input",
             in_a_stack=True,
             show_progress_bars=data.show,
-        ).flow
+        )
         return [flow[[version]] for version in range(len(versions))]
 
 

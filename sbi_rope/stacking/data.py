@@ -1,5 +1,6 @@
 """What the candidates of a stack are trained on: pairs, their folds, simulations."""
 
+import copy
 from collections.abc import Hashable, Sequence
 from functools import cached_property
 from typing import Any
@@ -16,7 +17,6 @@ from sbi_rope.discrepancy.correction import Space, tuning_targets
 from sbi_rope.discrepancy.model import DiscrepancyModel
 from sbi_rope.discrepancy.report import DiscrepancyReport, report_discrepancy
 from sbi_rope.npe.sbi import embed, has_parameters
-from sbi_rope.npe.standardisation import Standardisation
 from sbi_rope.rope.rope import RoPE
 from sbi_rope.utils.errors import NotReadyError
 from sbi_rope.utils.seeds import seeded
@@ -53,7 +53,7 @@ class StackData:
         self.rope, self.npe, self.show = rope, rope.npe, show_progress_bars
         self.estimator, self.source = rope.npe.estimator, rope.source
         self.prior, self.pairs = rope.npe.prior, rope.pairs
-        self.model, self.embedding_net = DiscrepancyModel(), rope.embedding_net
+        self.model, self.embedding_net = DiscrepancyModel(), copy.deepcopy(rope.npe.h)
         labels = len(self.pairs.label.unique())
         if (count := min(self.pairs.num_groups, labels)) < 2:
             raise NotReadyError(
@@ -169,14 +169,8 @@ class StackData:
         of_rows, pairs = self.moments(rows, "embedding"), self.pairs[rows]
         found = of_rows.mean.to(self.embedded)
         if not self.pairs.are_exact:
-            found = tuning_targets(
-                embed(self.embedding_net, pairs.x),
-                of_rows,
-                Standardisation(self.embedded.double()),
-                pairs.weight,
-                pairs.group,
-                seed=self.seed_of(rows),
-            )
+            z, seed = embed(self.embedding_net, pairs.x), self.seed_of(rows)
+            found = tuning_targets(pairs, z, of_rows, self.embedded, seed=seed)
         return found.new_zeros(len(self), found.shape[1]).index_copy(0, rows, found)
 
     @torch.no_grad()

@@ -313,8 +313,8 @@ def _simulator(report: StackingReport) -> Iterator[Line]:
         yield text, True
     else:
         yield "No entry of x shows a discrepancy.", False
-    for note in found.notes:
-        yield note, False
+    if found.constant:
+        yield f"The same in all simulations: {', '.join(found.constant)}.", False
 
 
 def _more_labels(report: StackingReport) -> Iterator[Line]:

@@ -91,7 +91,7 @@ def stack(
     start, calls = time.perf_counter(), rope.source.num_calls
     if x_o is not None:
         x_o = rope.npe.as_x("x_o", x_o)
-        warn_of_far_entries("x_o", x_o, rope.embedding_net)
+        warn_of_far_entries("x_o", x_o, rope.npe.h)
     of_data, of_scores = draw_seeds(seed, 2)
     data = StackData(
         rope,

@@ -135,7 +135,7 @@ def test_rope_makes_of_posteriors_of_the_family_others_that_can_be_pickled(
     found = copied.log_prob_batched(other, x_o, **unnormalised)
     assert torch.equal(found, log_prob_of_other)
     # The tuned posterior is the flow on the tuned embedding.
-    tuned, g, h = rope.tuned_posterior(), rope.tuned_embedding_net, rope.embedding_net
+    tuned, g, h = rope.tuned_posterior(), rope.tuned_embedding_net, rope.npe.h
     assert type(tuned) is DirectPosterior
     assert not torch.equal(embed(g, x_o), embed(h, x_o))
     expected = headless(npe.posterior_estimator).log_prob(other[None], embed(g, x_o))[0]

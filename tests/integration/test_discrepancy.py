@@ -2,8 +2,7 @@
 
 import functools
 import math
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ import torch
 from sbi.neural_nets import posterior_nn
 from scipy import stats
 from torch import Tensor
-from torch.distributions import Normal
 
 from sbi_rope.baselines import PlainNPE, Training
 from sbi_rope.discrepancy import DiscrepancyDraws, DiscrepancyModel
@@ -43,26 +41,16 @@ def simulator(theta: Tensor) -> Tensor:
     return theta + NOISE * torch.randn_like(theta)
 
 
-@dataclass(frozen=True)
-class Reality:
+class Reality(NamedTuple):
     """x_o = a theta + b + sd eps."""
 
     gain: float
     offset: float
     std: float
 
-    def __call__(self, theta: Tensor) -> Tensor:
-        return self.gain * theta + self.offset + self.std * torch.randn_like(theta)
-
     def labelled(self, n: int) -> tuple[Tensor, Tensor]:
         theta = torch.randn(n, 1)
-        return theta, self(theta)
-
-    def posterior(self, x: Tensor) -> Normal:
-        """theta | x with gain, offset and error known."""
-        variance = 1 / (1 + self.gain**2 / self.std**2)
-        mean = variance * self.gain * (x - self.offset) / self.std**2
-        return Normal(mean, variance**0.5)
+        return theta, self.gain * theta + self.offset + self.std * torch.randn(n, 1)
 
 
 def reality(seed: int) -> Reality:
@@ -97,16 +85,13 @@ def corrected(pairs: tuple[Tensor, Tensor], *, seed: int = 0, **options: Any) ->
     return method.build_posterior(), method.discrepancy
 
 
-def log_probs(posterior: Any, theta: Tensor, x: Tensor) -> Tensor:
-    return posterior.log_prob_batched(theta[None], x, norm_posterior=False)[0]
-
-
 THETA = torch.linspace(-5, 5, 201).double()
 
 
-def marginal(x: Tensor, draws: DiscrepancyDraws, *, std: float, mean: float) -> Tensor:
+def marginal(x: Tensor, draws: DiscrepancyDraws) -> Tensor:
     """log p(theta | x, pairs) on THETA by integration, ``(201, n)``."""
-    z, m = (x[:, 0].double() - mean) / std, (THETA - mean) / std
+    std = (1 + NOISE**2) ** 0.5
+    z, m = x[:, 0].double() / std, THETA / std
     gain, offset = draws.gain[:, 0, 0], draws.offset[:, 0]
     variance = draws.error_factor[:, 0, 0] ** 2 + gain**2 * (NOISE / std) ** 2
     residual = z - (gain[:, None, None] * m[:, None] + offset[:, None, None])
@@ -129,17 +114,12 @@ def test_the_posterior_is_that_with_the_discrepancy_integrated_out(
     posterior, discrepancy = corrected(pairs, space=space)
     draws = discrepancy.sample(1000, seed=1)
     x = real.labelled(40)[1]
-    std = (1 + NOISE**2) ** 0.5
-    expected = marginal(x, draws, std=std, mean=0.0)
+    expected = marginal(x, draws)
     grid = THETA.float()[:, None, None].expand(-1, 40, 1)
     log_q = posterior.log_prob_batched(grid, x, norm_posterior=False).double()
     step = float(THETA[1] - THETA[0])
     divergence = (expected.exp() * (expected - log_q) * step).sum(dim=0)
     assert float(divergence.mean()) < 0.03
-    known = real.posterior(x[:, 0].double()).log_prob(THETA[:, None])
-    plugged = (expected.exp() * (expected - known) * step).sum(dim=0)
-    # With few pairs it differs from the posterior of a known discrepancy.
-    assert (float(plugged.mean()) > 0.05) or num_pairs == 50
 
 
 @pytest.mark.slow
@@ -162,17 +142,3 @@ def test_intervals_of_90_percent_hold_90_percent_of_the_parameters(
     error = float(np.std(shares)) / len(shares) ** 0.5
     assert error < 0.02
     assert abs(float(np.mean(shares)) - 0.9) < 3 * error + 0.005
-
-
-@pytest.mark.slow
-def test_where_the_simulator_is_right_the_loss_against_npe_is_small() -> None:
-    right = Reality(1.0, 0.0, NOISE)
-    lost = []
-    for seed in range(2):
-        with seeded(seed):
-            pairs, (theta, x) = right.labelled(10), right.labelled(3000)
-        posterior, discrepancy = corrected(pairs, seed=seed, model=DiscrepancyModel())
-        assert discrepancy.probability_of_none > 0.7
-        before, after = (log_probs(p, theta, x) for p in (npe(), posterior))
-        lost.append(float((before - after).mean()))
-    assert sum(lost) / 2 < 0.05

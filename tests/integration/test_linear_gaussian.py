@@ -4,108 +4,35 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
-from sbi_rope import CalibrationFinetuner, MixturePosterior, RoPE, SinkhornCoupler
+from sbi_rope import MixturePosterior, RoPE, SinkhornCoupler
 from sbi_rope.density import Coupled
 from sbi_rope.metrics import evaluate
 from sbi_rope.npe.sbi import headless
 from tests import gaussian
 
 
-def with_exact_g(x_o: Tensor, n_s: int, coupler: SinkhornCoupler) -> MixturePosterior:
-    """The mixture for g(x_o) = h of the simulation behind x_o."""
-    npe = gaussian.posterior()
-    h = npe.posterior_estimator.embedding_net
-    with torch.no_grad():
-        simulated = h(gaussian.simulator(gaussian.prior().sample((n_s,))))
-        coupling = coupler.couple(h(gaussian.undo(x_o)), simulated)
-    density = headless(npe.posterior_estimator)
-    mixture = Coupled(density, x_o, coupling)
-    mixture.tail_mass = 0.0
-    return MixturePosterior(mixture, gaussian.prior())
-
-
-def divergence(x_s: Tensor, posterior: MixturePosterior, draws: int = 30) -> float:
-    """Mean over the batch of KL(exact || RoPE), by draws of the exact posterior."""
-    exact = gaussian.exact_posterior(x_s)
-    theta = exact.sample((draws,))
-    log_prob = posterior.log_prob_batched(theta, posterior.x_o, norm_posterior=False)
-    return float((exact.log_prob(theta) - log_prob).mean())
-
-
 @pytest.mark.slow
 def test_with_the_exact_g_the_mixture_approaches_the_exact_posterior() -> None:
+    """With g(x_o) = h of the simulation behind x_o."""
+    estimator: Any = gaussian.posterior().posterior_estimator
+    h, density = estimator.embedding_net, headless(estimator)
     errors = []
     for n in (30, 150, 600):
-        _, x_o = gaussian.labelled(n)
-        coupler = SinkhornCoupler(gamma=0.02, tau=0.9)
-        posterior = with_exact_g(x_o, n, coupler)
-        errors.append(divergence(gaussian.undo(x_o), posterior))
-    assert errors[0] > 1.5 * errors[1]
-    assert errors[1] > 1.5 * errors[2]
+        theta, x_o = gaussian.prior().sample((n,)), gaussian.labelled(n)[1]
+        x_s, coupler = gaussian.undo(x_o), SinkhornCoupler(gamma=0.02, tau=0.9)
+        with torch.no_grad():
+            simulated = h(gaussian.simulator(theta))
+            coupling = coupler.couple(h(x_s), simulated)
+        mixture = Coupled(density, x_o, coupling)
+        mixture.tail_mass = 0.0
+        posterior = MixturePosterior(mixture, gaussian.prior())
+        exact = gaussian.exact_posterior(x_s)
+        theta = exact.sample((30,))
+        log_prob = posterior.log_prob_batched(theta, x_o, norm_posterior=False)
+        errors.append(float((exact.log_prob(theta) - log_prob).mean()))
+    assert errors[0] > 1.5 * errors[1] > 2.25 * errors[2]
     assert errors[2] < 0.05
-
-
-@pytest.mark.slow
-def test_a_larger_gamma_moves_the_mixture_towards_the_prior() -> None:
-    _, x_o = gaussian.labelled(300)
-    x_s = gaussian.undo(x_o)
-    errors = [
-        divergence(x_s, with_exact_g(x_o, 300, SinkhornCoupler(gamma=gamma)))
-        for gamma in (0.05, 0.5, 50.0)
-    ]
-    assert errors[0] < errors[1] < errors[2]
-    # At the far end every posterior is the mean of all simulated ones, the prior.
-    theta = gaussian.exact_posterior(x_s).sample((100,))
-    prior_error = gaussian.exact_posterior(x_s).log_prob(theta)
-    prior_error = (prior_error - gaussian.prior().log_prob(theta)).mean()
-    assert errors[2] == pytest.approx(float(prior_error), abs=0.05)
-
-
-@pytest.mark.slow
-def test_without_misspecification_rope_hardly_moves_the_posterior() -> None:
-    """Tolerance in nats, on average over the batch, at gamma 0.05 and n = 1000.
-
-    It is what 1000 simulations cost: a balanced coupling has to use each of them.
-    """
-    x_o = gaussian.simulator(gaussian.prior().sample((1000,)))
-    for tau, tolerance in ((1.0, 0.1), (0.9, 0.05)):
-        rope = RoPE(
-            gaussian.posterior(),
-            simulator=gaussian.simulator,
-            coupler=SinkhornCoupler(gamma=0.05, tau=tau),
-        )
-        assert divergence(x_o, rope.build_posterior(x_o, seed=0)) < tolerance
-
-
-def test_at_tau_one_the_mean_posterior_is_the_mean_of_the_simulated_ones() -> None:
-    theta_cal, x_cal = gaussian.labelled(50)
-    _, x_o = gaussian.labelled(100)
-    rope = RoPE(
-        gaussian.posterior(),
-        simulator=gaussian.simulator,
-        finetuner=CalibrationFinetuner(learning_rate=1e-2, max_num_epochs=20),
-    )
-    rope.append_calibration(theta_cal, x_cal).train(show_progress_bars=False)
-    posterior = rope.build_posterior(
-        x_o,
-        coupler=SinkhornCoupler(gamma=0.2, tau=1.0, tolerance=1e-10),
-        num_simulations=150,
-    )
-    coupled: Any = posterior.posterior_estimator
-    coupled.tail_mass = 0.0
-    grid = torch.linspace(-3, 3, 7)
-    theta = torch.cartesian_prod(grid, grid)
-    batch = posterior.log_prob_batched(
-        theta[:, None].expand(-1, 100, -1), x_o, norm_posterior=False
-    )
-    simulated = coupled.density.log_prob(
-        theta[:, None].expand(-1, 150, -1), coupled.simulated
-    )
-    assert batch.exp().mean(dim=1).numpy() == pytest.approx(
-        simulated.exp().mean(dim=1).detach().numpy(), abs=1e-6
-    )
 
 
 @pytest.mark.medium

@@ -3,15 +3,17 @@
 import torch
 from torch import Tensor
 
+from sbi_rope.data.pairs import Pairs
 from sbi_rope.data.simulate import Moments
 from sbi_rope.discrepancy import DiscrepancyModel
 from sbi_rope.discrepancy.correction import fit_discrepancy, surprise
 from sbi_rope.npe.standardisation import Standardisation
 
 WIDTH = 9
+UNIT = Standardisation(torch.randn(2000, WIDTH).double())
 
 
-def pairs(n: int, *, error: float = 0.0, seed: int = 0) -> tuple[Tensor, Moments]:
+def observed(n: int, *, error: float = 0.0, seed: int = 0) -> tuple[Tensor, Moments]:
     """Observations of a simulator whose noise depends on the parameters.
 
     The standard deviation of ``error`` is in that of the noise.
@@ -28,16 +30,18 @@ def pairs(n: int, *, error: float = 0.0, seed: int = 0) -> tuple[Tensor, Moments
     return z, Moments(means=mean[:, None], covariance=factor @ factor.mT)
 
 
-def unit() -> Standardisation:
-    return Standardisation(torch.randn(2000, WIDTH).double())
+def pairs(z: Tensor, groups: Tensor | None = None) -> Pairs:
+    """Pairs that are independent of each other unless they are in groups."""
+    groups = torch.arange(len(z)) if groups is None else groups
+    return Pairs.exact(groups[:, None].double(), z)
 
 
 def test_the_surprise_of_a_right_simulator_is_about_standard_normal() -> None:
     """A little lower, because a smallest noise is assumed that is not there."""
     found = []
     for seed in range(300):
-        z, moments = pairs(20, seed=seed)
-        found.append(surprise(z, moments.means, moments.covariance))
+        z, moments = observed(20, seed=seed)
+        found.append(surprise(pairs(z), z, moments))
     values = torch.tensor(found)
     assert -0.5 < float(values.mean()) < 0.1
     assert 0.8 < float(values.std()) < 1.25
@@ -46,7 +50,7 @@ def test_the_surprise_of_a_right_simulator_is_about_standard_normal() -> None:
 
 def test_ten_pairs_refute_a_simulator_that_all_discrepancies_are_worse_than() -> None:
     """Each discrepancy of nine entries has so much to learn that evidence is small."""
-    z, moments = pairs(10, error=1.6)
+    z, moments = observed(10, error=1.6)
     # Rotated, so that no entry by itself is more precise than the others.
     turn, _ = torch.linalg.qr(torch.randn(WIDTH, WIDTH).double())
     covariance = turn @ moments.covariance @ turn.T
@@ -54,11 +58,10 @@ def test_ten_pairs_refute_a_simulator_that_all_discrepancies_are_worse_than() ->
     z = z @ turn.T
     evidence = DiscrepancyModel().fit(z, moments.mean, moments.covariance.mean(dim=0))
     assert evidence.probability_of_none > 0.99
-    torch.manual_seed(0)
-    found = fit_discrepancy(z, moments, unit(), DiscrepancyModel())
-    assert found.probability_of_none == 0.0
-    told = DiscrepancyModel(probability_of_none=1.0)
-    assert fit_discrepancy(z, moments, unit(), told).probability_of_none == 1.0
+    for prior, expected in ((0.5, 0.0), (1.0, 1.0)):
+        model = DiscrepancyModel(probability_of_none=prior)
+        found = fit_discrepancy(pairs(z), z, moments, UNIT, model)
+        assert found.probability_of_none == expected
 
 
 def test_people_who_differ_as_simulated_ones_do_not_refute_a_simulator() -> None:
@@ -75,21 +78,20 @@ def test_people_who_differ_as_simulated_ones_do_not_refute_a_simulator() -> None
         recording = 0.3 * torch.randn(80, WIDTH)
         z = mean + part.sqrt() * person + (1 - part).sqrt() * recording
         moments = Moments(means=mean[:, None], covariance=noise.expand(80, -1, -1))
-        arguments = z, moments, unit(), DiscrepancyModel()
-        apart.append(fit_discrepancy(*arguments).probability_of_none)
-        found = fit_discrepancy(*arguments, groups=groups)
-        together.append(found.probability_of_none)
+        for found, kept in ((apart, pairs(z)), (together, pairs(z, groups))):
+            fitted = fit_discrepancy(kept, z, moments, UNIT, DiscrepancyModel())
+            found.append(fitted.probability_of_none)
     assert max(apart) < 0.1
     assert min(together) > 0.9
 
 
 def test_copies_of_pairs_change_no_surprise_if_they_are_known_to_be_copies() -> None:
-    z, moments = pairs(20, error=1.0)
-    rows, groups = torch.arange(20).repeat(3), torch.arange(20).repeat(3)
-    plain = surprise(z, moments.means, moments.covariance)
-    copied = z[rows], moments.means[rows], moments.covariance[rows]
-    assert abs(surprise(*copied, groups=groups) - plain) < 1e-9
-    assert surprise(*copied) > 1.5 * plain
+    z, moments = observed(20, error=1.0)
+    rows, plain = torch.arange(20).repeat(3), surprise(pairs(z), z, moments)
+    copied = z[rows], moments[rows]
+    assert abs(surprise(pairs(z[rows], rows), *copied) - plain) < 1e-9
+    assert surprise(pairs(z[rows]), *copied) > 1.5 * plain
     # Of several possible means the nearest counts.
-    several = moments.means + torch.tensor([0.0, 5.0])[:, None].double()
-    assert abs(surprise(z, several, moments.covariance) - plain) < 1e-9
+    means = moments.means + torch.tensor([0.0, 5.0])[:, None].double()
+    several = Moments(means=means, covariance=moments.covariance)
+    assert abs(surprise(pairs(z), z, several) - plain) < 1e-9

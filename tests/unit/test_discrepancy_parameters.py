@@ -1,8 +1,5 @@
 """The distribution of parameters, learned from those of the calibration pairs."""
 
-import math
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 import torch
@@ -10,8 +7,8 @@ from scipy import stats
 from torch import Tensor
 from torch.distributions import Gamma
 
-from sbi_rope.data.parameters import STRENGTHS, _fit, normal_scores
-from sbi_rope.discrepancy import ParameterDistribution, learn_parameters
+from sbi_rope.data.parameters import STRENGTHS, _fit
+from sbi_rope.discrepancy import learn_parameters
 
 CORRELATION = torch.tensor([[1.0, 0.6], [0.6, 1.0]]).double()
 
@@ -39,9 +36,7 @@ def step_ahead(
     return evidence, np.atleast_1d(log_t(new))
 
 
-def test_evidence_and_prediction_agree_with_updates_by_one_pair_after_the_other() -> (
-    None
-):
+def test_evidence_and_prediction_are_those_of_one_update_after_the_other() -> None:
     for d in (1, 2):
         u = torch.randn(7, d).double() * 0.5 + 0.8
         new, correlation = torch.randn(5, d).double(), CORRELATION[:d, :d]
@@ -64,64 +59,18 @@ def skewed(n: int) -> Tensor:
     return torch.cat([first, 3 * first + Gamma(2.0, 0.1).sample((n, 1))], dim=1)
 
 
-def discrete(n: int) -> Tensor:
-    """A parameter of three values beside a continuous one."""
-    return torch.stack([torch.randint(3, (n,)).float(), torch.randn(n)], dim=1)
-
-
-def single(n: int) -> Tensor:
-    return 100.0 + 1e-3 * torch.randn(n, 1)
-
-
-def num_effective(learned: ParameterDistribution) -> float:
-    """How many equally probable simulations are as precise."""
-    return float(1 / learned.probabilities.square().sum())
-
-
-Prior = Callable[[int], Tensor]
-PRIORS: tuple[Prior, ...] = (box, skewed, discrete, single)
-
-
 @pytest.mark.medium
 def test_pairs_from_the_prior_hardly_change_it() -> None:
     improbable = 0
-    for prior in PRIORS:
+    for prior in (box, skewed):
         for n in (1, 10, 100):
-            torch.manual_seed(0)
             theta = prior(5000)
-            learned = [learn_parameters(prior(n), theta) for _ in range(10)]
+            learned = [learn_parameters(prior(n), theta) for _ in range(20)]
             probability = torch.tensor([one.probability_of_prior for one in learned])
-            size = torch.tensor([num_effective(one) for one in learned])
-            case = (prior.__name__, n)
-            assert float(probability.median()) > (0.75 if n == 100 else 0.45), case
-            assert float(size.median()) > 0.9 * 5000, case
+            assert float(probability.median()) > (0.75 if n == 100 else 0.45), n
             improbable += int((probability < 0.05).sum())
     # By Markov's inequality, at most one in 19 of these 120 sets of pairs is expected.
     assert improbable <= 120 / 19
-
-
-@pytest.mark.slow
-def test_shifted_pairs_give_more_density_to_parameters_like_theirs() -> None:
-    for prior in PRIORS:
-        theta = prior(20_000)
-        # Real parameters have large values of the last parameter.
-        high = theta[theta[:, -1] > theta[:, -1].quantile(0.7)]
-        for n, least in ((5, 0.05), (50, 0.3)):
-            gains = []
-            for _ in range(4):
-                rows = torch.randperm(len(high))
-                learned = learn_parameters(high[rows[:n]], theta)
-                held_out = (theta[:, None] == high[rows[n : n + 200]]).all(dim=2)
-                index = held_out.double().argmax(dim=0)
-                gains.append(
-                    float((20_000 * learned.probabilities[index]).log().mean())
-                )
-                if n == 50:
-                    assert learned.probability_of_prior < 1e-3, prior.__name__
-                    assert num_effective(learned) < 0.6 * 20_000, prior.__name__
-            # Who knows the region gains 1.2 nats.
-            case = (prior.__name__, n)
-            assert least < sum(gains) / 4 < math.log(1 / 0.3), case
 
 
 def test_weighted_simulations_have_the_mean_and_spread_of_the_pairs() -> None:
@@ -135,23 +84,18 @@ def test_weighted_simulations_have_the_mean_and_spread_of_the_pairs() -> None:
 def test_discrete_parameters_are_left_out() -> None:
     n = 20_000
     theta = torch.stack([torch.rand(n), (torch.arange(n) < n // 20).float()], dim=1)
-    pairs = torch.stack([torch.rand(100), torch.zeros(100)], dim=1)
     for ones in (0, 10, 100):
-        pairs[:ones, 1] = 1.0
+        pairs = torch.stack([torch.rand(100), (torch.arange(100) < ones).float()], 1)
         learned = learn_parameters(pairs, theta)
         assert learned.probability_of_prior > 0.5, ones
-        share = float(learned.probabilities[theta[:, 1] == 1].sum())
-        assert share == pytest.approx(0.05, abs=0.005), ones
         both = learn_parameters(pairs[:, :1], theta[:, :1])
         assert torch.allclose(learned.probabilities, both.probabilities, atol=1e-9)
+    assert learn_parameters(pairs[:, 1:], theta[:, 1:]).probability_of_prior == 0.5
     # Rounded labels of people who differ in a discrete parameter only are no copies.
     middle = (pairs[:, :1] / 5 + 0.4).mul(20).round() / 20
     people = torch.cat([middle, (torch.arange(100) % 2)[:, None]], dim=1)
     theta[:, 1] = (torch.arange(n) % 2).float()
     assert learn_parameters(people, theta).probability_of_prior < 0.05
-    of_counts = learn_parameters(pairs[:, 1:], theta[:, 1:])
-    assert of_counts.probability_of_prior == 0.5
-    assert num_effective(of_counts) == pytest.approx(n)
 
 
 def test_labels_that_are_rounded_to_the_bounds_are_draws_from_the_prior() -> None:
@@ -171,17 +115,3 @@ def test_several_recordings_of_a_person_count_once() -> None:
     often = learn_parameters(people.repeat_interleave(25, dim=0), theta)
     assert often.probability_of_prior == pytest.approx(once.probability_of_prior)
     assert torch.allclose(often.probabilities, once.probabilities)
-
-
-def test_normal_scores_of_the_reference_are_normal_and_outside_they_are_finite() -> (
-    None
-):
-    reference = Gamma(0.3, 1.0).sample((2000, 1))
-    scores = normal_scores(reference, reference)[:, 0].numpy()
-    assert stats.kstest(scores, "norm").pvalue > 0.99
-    outside = normal_scores(torch.tensor([[-1.0], [1e30]]), reference)
-    assert outside.isfinite().all()
-    assert (outside.abs() > 3.3).all()
-    # Values that are equal share the middle of their ranks: the median of three.
-    three = torch.tensor([[0.0], [1.0], [2.0]]).repeat(100, 1)
-    assert float(normal_scores(torch.ones(1, 1), three)) == pytest.approx(0.0)

@@ -1,6 +1,5 @@
 """Fine-tuning: its loss, the net that it keeps, and what it does not change."""
 
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -16,18 +15,13 @@ from sbi_rope.utils.seeds import seeded
 from tests import gaussian
 
 
-def linear(dim: int = 2) -> nn.Linear:
-    return gaussian.GaussianEstimator(dim).net  # type: ignore[return-value]
+def linear() -> nn.Module:
+    return gaussian.GaussianEstimator().net
 
 
 def finetune(
-    net: nn.Module,
-    x: Tensor,
-    targets: Tensor,
-    draw_targets: Callable[[], Tensor] | None = None,
-    simulations: Tensor | None = None,
-    **settings: Any,
-) -> tuple[nn.Module, History]:
+    net: nn.Module, x: Tensor, targets: Tensor, **settings: Any
+) -> tuple[Any, History]:
     with seeded(0):
         nets, [history] = CalibrationFinetuner(**settings).tuned(
             net,
@@ -35,8 +29,7 @@ def finetune(
             [targets],
             [torch.arange(len(x))],
             groups=torch.arange(len(x)),
-            draw_simulations=lambda count: simulations,  # type: ignore[return-value]
-            draw_targets=draw_targets,
+            draw_simulations=lambda count: torch.ones(7, 1),
         )
     return nets.member(0), history
 
@@ -61,9 +54,8 @@ def test_many_pairs_lead_to_the_minimiser_known_in_closed_form() -> None:
     settings = {"learning_rate": 3e-3, "max_num_epochs": 600}
     g, _ = finetune(linear(), x_o, gaussian.GAIN * theta, **settings)
     slope = gaussian.GAIN**2 / gaussian.SCALE
-    weight, bias = g.weight.detach(), g.bias.detach()  # type: ignore[union-attr]
-    assert torch.allclose(weight, slope * torch.eye(2), atol=0.02)
-    assert torch.allclose(bias, torch.full((2,), -slope * gaussian.SHIFT), atol=0.02)
+    assert torch.allclose(g.weight, slope * torch.eye(2), atol=0.02)
+    assert torch.allclose(g.bias, -slope * gaussian.SHIFT * torch.ones(2), atol=0.02)
 
 
 def test_the_net_that_is_kept_is_the_best_on_the_held_out_pairs() -> None:
@@ -97,16 +89,6 @@ def test_a_net_without_parameters_gets_an_affine_map_that_starts_as_identity() -
     assert (tuned(x) - (1.3 * x - 0.2)).norm(dim=1).mean() < 0.02
 
 
-def test_the_targets_of_held_out_pairs_stay_the_same_with_resampling() -> None:
-    x, net = torch.randn(20, 2), linear()
-    draws = iter([1e3 * torch.randn(20, 2) for _ in range(4)])
-    settings = {"learning_rate": 1e-9, "max_num_epochs": 5}
-    _, history = finetune(net, x, net(x).detach(), lambda: next(draws), **settings)
-    assert max(history.validation_loss) < 1e-4
-    assert min(history.training_loss[1:]) > 10
-    assert next(draws, None) is None  # one for each step
-
-
 def test_without_a_hold_out_an_affine_map_gets_the_largest_rate() -> None:
     x = torch.randn(4, 2)
     for net, rate in ((linear(), 1e-4), (nn.Identity(), 1e-3)):
@@ -124,5 +106,5 @@ def test_rehearsal_minimises_the_sum_known_in_closed_form() -> None:
         net = nn.Linear(1, 1, bias=False)
         nn.init.ones_(net.weight)
         settings = {"rehearsal": rehearsal, "learning_rate": 0.05}
-        g, _ = finetune(net, x, 2 * x, simulations=torch.ones(7, 1), **settings)
-        assert float(g.weight) == pytest.approx(slope, abs=0.1)  # type: ignore[arg-type]
+        g, _ = finetune(net, x, 2 * x, **settings)
+        assert float(g.weight) == pytest.approx(slope, abs=0.1)

@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 import torch
 from sbi.inference import NPE
-from sbi.neural_nets import posterior_nn
-from torch import Tensor, nn
+from torch import Tensor
 
 from sbi_rope.baselines import Training
 from sbi_rope.methods.training import (
@@ -18,7 +17,6 @@ from sbi_rope.methods.training import (
     estimator_builder,
     train_on_simulations,
 )
-from sbi_rope.training.fit import History
 from tests.problems import box, simulate
 
 pytestmark = [
@@ -34,49 +32,24 @@ def test_the_settings_of_a_training_are_arguments_of_sbis_train() -> None:
         assert known[field.name].default == field.default
 
 
-def small(net: nn.Module | None = None) -> Any:
-    net = nn.Identity() if net is None else net
-    return posterior_nn("mdn", embedding_net=net, hidden_features=8, num_components=2)
-
-
-def test_each_estimator_has_a_copy_of_the_net() -> None:
-    net = nn.Linear(3, 2)
-    build = estimator_builder(small(net))
-    theta, x = torch.randn(20, 2), torch.randn(20, 3)
-    each = [net, build(theta, x), build(theta, x)]
-    ids = [id(p) for one in each for p in one.parameters()]
-    assert len(set(ids)) == len(ids)
-
-
-def pairs(n: int) -> tuple[Tensor, Tensor]:
-    theta = box(2).sample((n,))
-    return theta, simulate(theta)
-
-
-def with_sbi(n: int = 60, **options: Any) -> tuple[Any, History]:
-    settings: dict[str, Any] = {"max_num_epochs": 5, "training_batch_size": 20}
-    settings.update(options)
-    return train_on_simulations(
-        box(2),
-        estimator_builder(small()),
-        *pairs(n),
-        training=Training(**settings),
-        show_progress_bars=False,
-    )
-
-
-def test_training_prints_nothing_and_writes_nothing(
+def test_training_leaves_no_trace_and_its_history_is_that_of_the_epochs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    with_sbi(stop_after_epochs=1, max_num_epochs=100, learning_rate=0.1)
+    theta = box(2).sample((60,))
+    estimator, history = train_on_simulations(
+        box(2),
+        estimator_builder("mdn"),
+        theta,
+        simulate(theta),
+        training=Training(
+            learning_rate=0.05, max_num_epochs=40, training_batch_size=20
+        ),
+        show_progress_bars=False,
+    )
     assert os.listdir(tmp_path) == []
     printed = capsys.readouterr()
     assert printed.out == printed.err == ""
-
-
-def test_the_history_is_that_of_the_epochs() -> None:
-    estimator, history = with_sbi(learning_rate=0.05, max_num_epochs=40)
     assert len(history.training_loss) == len(history.validation_loss) <= 40
     assert history.kept_validation_loss == min(history.validation_loss)
     assert history.validation_loss[history.best_epoch] < history.validation_loss[0]
