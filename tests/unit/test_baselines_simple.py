@@ -180,8 +180,16 @@ def test_its_ablations_are_rope_itself(source: dict[str, Any]) -> None:
     coupler = SinkhornCoupler(gamma=0.8, tau=0.9)
     theta, (_, x_o) = torch.randn(1, 7, 2), TASK.get_test_set(30)
     rope = RoPE(given, finetuner=finetuner, coupler=coupler, **source)
+    stored = source.get("simulations")
+
+    def made(kind: type[Method], **options: Any) -> Method:
+        if stored:
+            method = kind.from_posterior(given, **options)
+            return method.append_simulations(*stored)
+        return kind.from_posterior(given, **options, **source)
+
     # Transport without tuning.
-    method = OTOnly.from_posterior(given, num_simulations=50, coupler=coupler, **source)
+    method = made(OTOnly, num_simulations=50, coupler=coupler)
     mixture = train(method.append_observations(x_o)).build_posterior()
     expected = rope.build_posterior(x_o, num_simulations=50, seed=0)
     assert torch.equal(mixture.weights, expected.weights)
@@ -190,7 +198,7 @@ def test_its_ablations_are_rope_itself(source: dict[str, Any]) -> None:
     # Tuning without transport.
     pairs = TASK.get_calibration_set(20)
     rope.append_calibration(*pairs).train(seed=0, show_progress_bars=False)
-    tuned = TuningOnly.from_posterior(given, finetuner=finetuner, **source)
+    tuned = made(TuningOnly, finetuner=finetuner)
     posterior = train(tuned.append_calibration(*pairs)).build_posterior()
     expected = log_prob(rope.tuned_posterior(), theta, x_o[:7])
     assert torch.equal(log_prob(posterior, theta, x_o[:7]), expected)
