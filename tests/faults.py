@@ -181,7 +181,7 @@ FAULTS = [
     Fault(
         "The density of a label is the geometric mean over its nodes",
         "data.pairs:Nodes.log_mean",
-        lambda right: lambda self, log_q: self._terms(log_q).mean(dim=1),
+        lambda right: lambda self, log_q: log_q.double().mean(dim=1),
         "unit/test_labels.py",
     ),
     Fault(
@@ -279,7 +279,7 @@ FAULTS = [
     Fault(
         "The noise of the Gaussian process is forgotten",
         "density.regression:_learned",
-        result(lambda found: (*found[:-1], 1e-4 * found[-1])),
+        result(lambda found: torch.cat([found[:-1], 1e-4 * found[-1:]])),
         "unit/test_regression.py",
     ),
     # --- sets ---
@@ -346,10 +346,10 @@ FAULTS = [
         "unit/test_discrepancy_model.py unit/test_discrepancy_none.py",
     ),
     Fault(
-        "The search for a discrepancy ignores observations without labels",
+        "The search for a discrepancy sees noise instead of observations",
         "discrepancy.unlabelled:fit_unlabelled",
-        argument(z_o=lambda z: z[:1]),
-        "integration/test_stacking_unlabelled.py",
+        argument(z_o=lambda z: 2 * torch.randn_like(z)),
+        "integration/test_stacking_labels.py",
     ),
     # --- stack ---
     Fault(
@@ -428,9 +428,9 @@ FAULTS = [
         "unit/test_metrics.py",
     ),
     Fault(
-        "Two sets are compared by their distances across only",
+        "The energy of two sets is that of another division",
         "metrics.statistics:_energies",
-        result(torch.abs),
+        argument(member=lambda member: member.roll(1, 0)),
         "unit/test_diagnosis.py unit/test_metrics.py",
     ),
     Fault(
@@ -448,7 +448,7 @@ FAULTS = [
     Fault(
         "Residuals come from a net that has seen their pairs",
         "diagnosis.prior_shift:cross_fit",
-        result(lambda found: found._replace(embedded=found.targets)),
+        result(lambda found: (found[1], found[1])),
         "unit/test_diagnosis.py",
     ),
     # --- networks and priors ---
