@@ -139,13 +139,6 @@ class SetScores:
         """Return the share of pairs in their sets of highest density of a level."""
         return float((self.joint <= level).double().mean())
 
-    def level_needed(self, level: float) -> float:
-        """Return the level of highest-density sets as large as guaranteed ones.
-
-        A level above 1 means that they reach further than all draws.
-        """
-        return float(self.joint.kthvalue(rank_needed(level, len(self))).values)
-
     def rank(self, level: float) -> int:
         """Return ``rank_needed`` for a guarantee; raise if the pairs cannot give it."""
         n, rank = len(self), rank_needed(level, len(self))
