@@ -8,7 +8,6 @@ from sbi_rope.rope.finetuning import CalibrationFinetuner
 from sbi_rope.rope.rope import RoPE
 from sbi_rope.saving import load, save
 from sbi_rope.stacking import StackedPosterior, stack
-from sbi_rope.utils import errors as errors
 
 __all__ = [
     "CalibrationFinetuner",

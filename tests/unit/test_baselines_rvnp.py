@@ -118,8 +118,8 @@ def real(n: int, offset: float, extra_std: float) -> tuple[Tensor, Tensor]:
 @pytest.mark.parametrize(
     ("offset", "extra_std", "shift", "least", "most"),
     [
-        (0.7, 0.0, True, -0.01, 0.5),  # it undoes most of an offset
-        (0.7, 0.7, True, -0.01, 0.5),  # and learns the noise
+        (0.7, 0.0, True, -0.01, 0.3),  # it undoes most of an offset
+        (0.7, 0.7, True, -0.01, 0.3),  # and learns the noise
         (0.0, 0.0, True, -0.01, 0.25),  # and stays near NPE if the simulator is right
         (0.7, 0.0, False, 0.4, 5.0),  # without one in the errors it undoes none
     ],
@@ -138,8 +138,10 @@ def test_it_loses_few_nats_without_labels(
         training=training,
     )
     method.append_simulations(*simulations())
+    torch.manual_seed(0)
     method.append_observations(real(600, offset, extra_std)[1])
     posterior = train(method).build_posterior()
+    torch.manual_seed(1)
     theta, x = real(1000, offset, extra_std)
     variance = gaussian.NOISE_STD**2 + extra_std**2
     std = torch.tensor((variance / (1 + variance)) ** 0.5)
