@@ -226,7 +226,7 @@ class Case:
         )
         seconds = path.with_suffix(".seconds")
         if not path.exists():
-            start = time.perf_counter()
+            start = time.process_time()
             npe = PlainNPE(
                 self.task.get_prior(),
                 self.builder,
@@ -236,7 +236,7 @@ class Case:
             npe.append_simulations(*self.simulations)
             npe.train(seed=self.seed, show_progress_bars=False)
             path.parent.mkdir(parents=True, exist_ok=True)
-            seconds.write_text(str(time.perf_counter() - start))
+            seconds.write_text(str(time.process_time() - start))
             save(npe.build_posterior(), path, overwrite=True)
         posterior = load(path)
         if self.device != "cpu":
