@@ -8,9 +8,8 @@
 `run` keeps each result in `OUT/SUITE` as soon as it is there, and computes only what is
 missing; `--retry` also what failed, and `--again` also what another version of the code
 has made. It ends with status 1 if a cell failed. `status` counts cells. `summary`
-writes the tables of README, of `benchmarks/results/README.md` and of pages of docs, and
-draws their pictures. With `--out benchmarks/results` it goes on from the
-committed results.
+writes the tables of README and of pages of docs, and draws their pictures. With
+`--out benchmarks/results` it goes on from the committed results.
 """
 
 import argparse
@@ -110,9 +109,10 @@ def _status(args: argparse.Namespace) -> int:
 def _summary(args: argparse.Namespace) -> int:
     published, pages = Published.read(args.out), pages_with_blocks(ROOT)
     write_pages(published, pages)
-    draw_overview(published)
+    draw_overview(published, ROOT / "docs/pictures/benchmark.png")
     for name, suite in published.suites.items():
-        draw_suite(suite, published.rows[name], args.out / name)
+        if name not in ("main", "earlier"):
+            draw_suite(suite, published.rows[name], args.out / name)
     print(f"Written: {', '.join(map(str, pages))}")
     return 0
 

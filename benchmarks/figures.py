@@ -12,9 +12,9 @@ from matplotlib.ticker import MaxNLocator
 
 from benchmarks.cells import Cell, data_in_words
 from benchmarks.methods import METHODS, STACK
-from benchmarks.published import LETTERS, Published, finished, known, relative_ranks
+from benchmarks.published import LETTERS, Published, finished, known
 from benchmarks.suites import Suite
-from sbi_rope.plots._figures import empty_figure, hide_frame, new_figure
+from sbi_rope.plots._figures import empty_figure, hide_frame
 from sbi_rope.utils.files import write_atomically
 
 # Cells with the same of these have the same data, but for the repetition.
@@ -22,28 +22,29 @@ WHERE = ["task", "variant", "options"]
 # With the distances as they are, as in the paper.
 UNSCALED = {"RoPE": "#003050", "OT-only": "#2A6F97"}
 # Lines that differ in calibration pairs only.
-MARKERS = {10: "o", 50: "s", 200: "^", 1000: "D"}
+MARKERS = {10: "o", 50: "s", 200: "^"}
 # More labels than these run into each other.
 MAX_TICKS = 5
 # More panels than this go to another row.
 MAX_COLUMNS = 9
 # Lines of a legend in an inch of height.
 LEGEND_LINES = 4.5
-# The methods of the picture of all tasks: what a user starts from, what is tuned on
+# The methods of the picture of all tasks: what a user starts from, what learns from
 # pairs, the rivals of 2025 and 2026, the paper's method and our default.
 SHOWN = (
     "prior",
     "SBI",
     "NPE",
-    "fine-tuned NPE",
+    "RVNP",
+    "Regression",
     "fine-tuned NPE (averaged)",
-    "FMCPE (embedding)",
+    "FMCPE",
     "FRISBI (distilled)",
     "RoPE",
     STACK,
 )
 # Panels side by side, so that they can be read at the width of a page.
-SHOWN_COLUMNS = 4
+SHOWN_COLUMNS = 5
 
 
 class LPPAxis:
@@ -77,17 +78,15 @@ def draw_suite(suite: Suite, rows: pd.DataFrame, folder: Path) -> None:
         _save(curves(suite.x_axis, rows), folder / f"{suite.x_axis}.png")
 
 
-def draw_overview(published: Published) -> None:
-    """Draw scores on all tasks, and ranks over tasks, beside the tables."""
+def draw_overview(published: Published, path: Path) -> None:
+    """Draw scores on all tasks into a file."""
     rows = finished(published.main)
     order = {task: place for place, task in enumerate(LETTERS)}
     shown = rows[rows["method"].isin(SHOWN)].sort_values(
         "task", kind="stable", key=lambda tasks: tasks.map(order)
     )
     figure = curves("n_calibration", shown, max_columns=SHOWN_COLUMNS)
-    _save(figure, published.folder / "methods.png")
-    ranks = relative_ranks(published.main, beside=STACK)
-    _save(rank_figure(ranks), published.folder / "ranks.png")
+    _save(figure, path)
 
 
 def _save(figure: Figure, path: Path) -> None:
@@ -244,30 +243,3 @@ def _position(axis: str, cell: Cell) -> float | None:
 
 def _is_option(axis: str) -> bool:
     return axis not in ("n_calibration", "gamma", "tau")
-
-
-# Ranks -------------------------------------------------------------------------------
-
-
-def rank_figure(ranks: pd.DataFrame) -> Figure:
-    """Draw means over tasks with bootstrap intervals; see `relative_ranks`."""
-    mean = ranks.mean(axis=1).sort_values(ascending=False)
-    values = ranks.loc[mean.index].to_numpy()
-    num_tasks = values.shape[1]
-    draws = np.random.default_rng(0).integers(num_tasks, size=(2000, num_tasks))
-    resampled = values[:, draws]
-    # A draw may have none of the tasks that a method was run on.
-    with np.errstate(invalid="ignore"):
-        means = np.nansum(resampled, axis=2) / np.isfinite(resampled).sum(axis=2)
-    low, high = np.nanquantile(means, [0.025, 0.975], axis=1)
-    figure, axes = new_figure(7, 0.28 * len(mean) + 1)
-    names = []
-    for height, (name, value) in enumerate(mean.items()):
-        colour = METHODS[str(name)].style[0]
-        axes.plot([low[height], high[height]], [height] * 2, c=colour)
-        axes.plot(value, height, "o", color=colour)
-        run = int(np.isfinite(values[height]).sum())
-        names.append(f"{name}" if run == num_tasks else f"{name} [{run} tasks]")
-    axes.set_yticks(range(len(mean)), names)
-    axes.set_xlabel(f"mean rank over {num_tasks} tasks: 0 is best, 1 last or failed")
-    return figure

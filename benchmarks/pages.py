@@ -1,4 +1,4 @@
-"""Tables of README, of the page of all results, and of pages of docs.
+"""Tables of README and of pages of docs.
 
 A page has a place for each of its tables,
 
@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchmarks.methods import GIVEN_PRIOR_STACK, METHODS, STACK
+from benchmarks.methods import GIVEN_PRIOR_STACK, METHODS, OBSERVED_STACK, STACK
 from benchmarks.published import (
     LETTERS,
-    MAX_PAIRS,
+    MOST,
     NEAR,
     PAPER,
     SIZE,
@@ -43,6 +43,15 @@ MARKER = re.compile(r"<!-- /?results")
 MISSING = "-"
 # Numbers of pairs that are shown side by side.
 FEW = (10, 50, 200)
+# What a stack must not be below.
+BASICS = {"prior", "NPE", "Regression"}
+# Variants of the suite `stacking`.
+WRONG = {
+    "": "the simulator",
+    "prior_shift": "the prior, too",
+    "other_cruises": "the pairs: other cruises",
+    "well_specified": "nothing",
+}
 Lines = list[str]
 # What `Published.select` is asked for.
 Fields = dict[str, Any]
@@ -51,7 +60,7 @@ Fields = dict[str, Any]
 def pages_with_blocks(root: Path) -> list[Path]:
     """Return the pages of a project that have places for tables."""
     docs = [path for path in root.glob("docs/**/*.md") if "_build" not in path.parts]
-    pages = [root / "README.md", root / "benchmarks/results/README.md", *sorted(docs)]
+    pages = [root / "README.md", *sorted(docs)]
     return [page for page in pages if MARKER.search(page.read_text(encoding="utf-8"))]
 
 
@@ -88,34 +97,6 @@ def table(head: Sequence[object], lines: Iterable[Iterable[object]]) -> Lines:
     return [first, f"|{'|'.join([' --- '] * len(head))}|", *others]
 
 
-def number_text(values: pd.Series, form: str) -> str:
-    """Return the mean over repetitions and, of several, the standard deviation.
-
-    One -inf makes the mean -inf, without a spread.
-    """
-    average = float(values.mean())
-    if len(values) < 2 or not np.isfinite(average):
-        return f"{average:{form}}"
-    return f"{average:{form}} ± {values.std():{form.lstrip('+')}}"
-
-
-def lpp_text(rows: pd.DataFrame) -> str:
-    """Return the LPP over repetitions, and whether a coupling has not converged."""
-    text = number_text(rows["lpp_z"], ".2f")
-    return text + ("" if rows["converged"].all() else " (not converged)")
-
-
-def acauc_text(rows: pd.DataFrame) -> str:
-    """Return the ACAUC over repetitions."""
-    return number_text(rows["acauc"], "+.3f")
-
-
-def costs_text(rows: pd.DataFrame) -> str:
-    """Return seconds without the training of NPE, and simulations with those of NPE."""
-    seconds = (rows["seconds_train"] + rows["seconds_couple"]).mean()
-    return f"{seconds:.0f} / {rows['num_simulations'].mean():,.0f}"
-
-
 def entry(
     rows: pd.DataFrame, text: Callable[[pd.DataFrame], str], out_of: int | None = None
 ) -> str:
@@ -137,7 +118,7 @@ def entry(
     )
 
 
-# All suites, and all tasks of `main` --------------------------------------------------
+# What was run, and all tasks of `main` ------------------------------------------------
 
 
 def _overview(published: Published) -> Lines:
@@ -145,18 +126,25 @@ def _overview(published: Published) -> Lines:
     lines = []
     for name, suite in published.suites.items():
         rows = published.rows[name]
+        rows = rows[rows["suite"] == name]
         if name == "smoke":  # its numbers mean nothing
             continue
         missing = {*suite.cells} - {*rows.index}
         lines.append(
             [
-                f"[{name}]({name}/{suite.x_axis}.png)" if len(rows) else name,
+                name,
                 (rows["status"] == "finished").sum(),
                 _counts(rows["method"][rows["status"] == "failed"]),
-                _counts(f"{cell.task} {cell.variant}".strip() for cell in missing),
+                _counts(cell.method for cell in missing),
+                _commits(rows),
             ]
         )
-    return table(("suite", "finished", "failed", "not run"), lines)
+    return table(("suite", "finished", "failed", "not run", "commits"), lines)
+
+
+def _commits(rows: pd.DataFrame) -> str:
+    commits = sorted({*rows["git_commit"].dropna()})
+    return ", ".join(commits) if len(commits) < 3 else f"{len(commits)}, see the rows"
 
 
 def _counts(names: Iterable[str]) -> str:
@@ -166,31 +154,40 @@ def _counts(names: Iterable[str]) -> str:
     return f"{sum(count for _, count in counts)}" + (f": {each}" if each else "")
 
 
-def _all_tasks(published: Published, text: Callable[[pd.DataFrame], str]) -> Lines:
-    """Return a table of all methods on all tasks; the best LPPs are bold."""
-    run = {*published.rows["main"]["task"]}
-    tasks = [task for task in LETTERS if task in run]
-    columns = [_column(published, task, text) for task in tasks]
-    lines = [
-        [name, *(column[name] for column in columns)]
-        for name in columns[0]
-        if any(column[name] != MISSING for column in columns)
-    ]
-    return table(("", *map(published.name, tasks)), lines)
+def _scores(published: Published) -> Lines:
+    r"""Return the LPP of all methods on all tasks; the best are bold.
 
-
-def _column(
-    published: Published, task: str, text: Callable[[pd.DataFrame], str]
-) -> dict[str, str]:
-    parts = {name: published.select(name, task=task) for name in METHODS}
-    count = num_repetitions(parts.values())
-    best = _best(parts, count) if text is lpp_text else None
+    The last columns are the mean \|ACAUC\| over tasks and repetitions, and the median
+    over tasks of the seconds beside NPE's own training.
+    """
+    usual = num_repetitions([published.rows["main"]])
+    rows = {name: published.select(name) for name in METHODS}
+    run = {*rows[STACK]["git_commit"]}
     # It does not compete, or one of two would be chosen by the reported score.
-    parts[f"RoPE ({PAPER})"] = published.select("RoPE", task=task, setting=PAPER)
-    entries = {name: entry(part, text, count) for name, part in parts.items()}
-    if best is not None:
-        entries[best] = f"**{entries[best]}**"
-    return {"repetitions": str(count), **entries}
+    rows[f"RoPE ({PAPER})"] = published.select("RoPE", setting=PAPER)
+    rows = {name: part for name, part in rows.items() if len(part)}
+    columns = {}
+    for task in LETTERS:
+        parts = {name: part[part["task"] == task] for name, part in rows.items()}
+        columns[task] = {name: entry(part, _lpp, usual) for name, part in parts.items()}
+        if best := _best(parts, usual):
+            columns[task][best] = f"**{columns[task][best]}**"
+    lines = []
+    for name, part in rows.items():
+        mark = " †" if {*part["git_commit"]} - run else ""
+        known = finished(part)
+        by_task = (known["seconds_train"] + known["seconds_couple"]).groupby(
+            known["task"]
+        )
+        costs = f"{known['acauc'].abs().mean():.3f}", f"{by_task.mean().median():.0f}"
+        lines.append([name + mark, *(columns[task][name] for task in LETTERS), *costs])
+    head = ("", *map(published.name, LETTERS), "\\|ACAUC\\|", "seconds")
+    return table(head, lines)
+
+
+def _lpp(rows: pd.DataFrame) -> str:
+    text = _mean_text(rows)
+    return text + ("" if rows["converged"].all() else " (not converged)")
 
 
 def _best(rows: Mapping[str, pd.DataFrame], repetitions: int) -> str | None:
@@ -198,10 +195,35 @@ def _best(rows: Mapping[str, pd.DataFrame], repetitions: int) -> str | None:
     known = {
         name: score
         for name, part in rows.items()
-        if name != "SBI" and len(finished(part)) == repetitions
+        if name in METHODS and name != "SBI" and len(finished(part)) == repetitions
         if (score := mean(part)) is not None and score > -math.inf
     }
     return max(known, key=known.__getitem__, default=None)
+
+
+def _of_the_stack(published: Published) -> Lines:
+    """Return what the stack reaches and costs with more and more pairs, by task."""
+    lines = []
+    for task in LETTERS:
+
+        def of_sizes(method: str, column: str, form: str, task: str = task) -> str:
+            parts = [published.select(method, task=task, size=n) for n in FEW]
+            means = [mean(part, column) for part in parts]
+            texts = [MISSING if one is None else f"{one:{form}}" for one in means]
+            return MISSING if {*texts} == {MISSING} else " / ".join(texts)
+
+        lines.append(
+            [
+                published.name(task),
+                of_sizes(STACK, "lpp_z", ".2f"),
+                of_sizes(OBSERVED_STACK, "lpp_z", ".2f"),
+                of_sizes(STACK, "acauc", "+.3f"),
+                of_sizes(STACK, "seconds_train", ".0f"),
+                f"{mean(published.select('NPE', task=task), 'seconds_npe') or 0:.0f}",
+            ]
+        )
+    head = ("LPP", "LPP with x_o", "ACAUC", "seconds", "seconds of NPE's training")
+    return table(("", *head), lines)
 
 
 # A method against the best other ------------------------------------------------------
@@ -213,7 +235,7 @@ def _not_the_best(published: Published) -> Lines:
     for one in compare(finished(published.main)):
         best = one.best()
         assert best is not None
-        if one.size > MAX_PAIRS or one.is_near(best):
+        if one.is_near(best):
             continue
         gap = one.gaps[best]
         own = one.rows[one.rows["repetition"].isin(gap.index)]
@@ -236,46 +258,61 @@ def _not_the_best(published: Published) -> Lines:
 def _goals(published: Published) -> Lines:
     """Say how often each goal was met, and where it was not."""
     rows = finished(published.main)
-    few = [one for one in compare(rows) if one.size <= MAX_PAIRS]
+    cells, observed = compare(rows), compare(rows, OBSERVED_STACK)
+    stacks, sbi = (rows[rows["method"] == name] for name in (STACK, "SBI"))
+    means = stacks.groupby(["task", "n_calibration"])[["seconds_train", "seconds_npe"]]
+    seconds = means.mean().query("seconds_train >= seconds_npe").index
     near, above = Comparison.is_near, Comparison.is_above
-    goals = {
-        "best, or within 0.1 nats of the best": (near, {}),
-        "best, or within 0.1 nats of the best of those that see no more data": (
-            near,
-            {"unlabelled": False},
+    unit = "best, or within 0.1 nats of the best"
+    return [
+        "The stack is",
+        _counted(unit, cells, near),
+        _counted(
+            f"{unit} of those that see no more data", cells, near, unlabelled=False
         ),
-        "better than the best other beyond the interval over repetitions": (above, {}),
-        "better beyond that interval than the best of those that are not of this "
-        "package": (above, {"ours": False}),
-    }
-    lines = [f"With up to {MAX_PAIRS} pairs the stack is"]
-    for goal, (holds, among) in goals.items():
-        met = {
-            f"{one.task} ({one.size})": holds(one, best)
-            for one in few
-            if (best := one.best(**among)) is not None
-        }
-        lines.append(_counted(goal, met))
-    basics = {
-        f"{one.task} ({one.size})": all(one.is_near(name) for name in ("prior", "NPE"))
-        for one in few
-        if {"prior", "NPE"} <= {*one.gaps}
-    }
-    lines.append(_counted("not more than 0.1 nats below the prior or NPE", basics))
-    acauc = np.mean([one.rows["acauc"].abs().mean() for one in few])
-    sbi = rows[(rows["method"] == "SBI") & rows["task"].isin([o.task for o in few])]
-    of_sbi = sbi["acauc"].abs().groupby(sbi["task"]).mean().mean()
-    lines.append(
-        f"- of a mean |ACAUC| of {acauc:.3f} over tasks, pairs and repetitions (aimed "
-        f"at 0.03; SBI has {of_sbi:.3f} on these tasks)"
-    )
-    return lines
+        _counted(
+            "better than the best that is not of this package, beyond the interval "
+            "over repetitions",
+            *(cells, above),
+            ours=False,
+        ),
+        _counted(
+            "not more than 0.1 nats below the prior, NPE or Regression",
+            cells,
+            lambda one, _: all(one.is_near(name) for name in BASICS & {*one.gaps}),
+        ),
+        _counted(
+            "trained in less time than NPE",
+            cells,
+            lambda one, _: (one.task, one.size) not in seconds,
+        ),
+        f"- of a mean |ACAUC| of {_acauc(stacks)} (aimed at 0.03; SBI: {_acauc(sbi)})",
+        "",
+        "The stack with x_o is",
+        _counted(unit, observed, near),
+    ]
 
 
-def _counted(goal: str, met: Mapping[str, bool]) -> str:
+def _counted(
+    goal: str,
+    cells: Sequence[Comparison],
+    holds: Callable[[Comparison, str], bool],
+    **among: bool,
+) -> str:
+    """Count where something holds against the best other; name the others, if few."""
+    met = {
+        f"{one.task} ({one.size})": holds(one, best)
+        for one in cells
+        if (best := one.best(**among)) is not None
+    }
     missed = [name for name, is_met in met.items() if not is_met]
     named = f"; not {', '.join(missed)}" if 0 < len(missed) <= len(met) / 2 else ""
     return f"- {goal}: {sum(met.values())} of {len(met)}{named}"
+
+
+def _acauc(rows: pd.DataFrame) -> str:
+    """Return the mean |ACAUC|, in which all tasks count the same."""
+    return f"{rows['acauc'].abs().groupby(rows['task']).mean().mean():.3f}"
 
 
 def _against_candidates(published: Published) -> Lines:
@@ -290,10 +327,16 @@ def _against_candidates(published: Published) -> Lines:
             "held_out": (lpp - rows["held_out"]).abs() <= 2 * rows["held_out_error"],
         }
     )
-    lines = counted.groupby(rows["n_calibration"]).sum().reset_index().to_numpy()
-    head = ("pairs", "stacks", "within 0.1 of the best candidate")
+    lines = []
+    for variant, name in WRONG.items():
+        of_variant = counted[rows["variant"] == variant]
+        sums = of_variant.groupby(rows["n_calibration"].replace(*MOST)).sum()
+        columns = [" / ".join(map(str, column)) for column in sums.to_numpy().T]
+        if len(sums):
+            lines.append([name, *columns])
+    head = ("stacks", "within 0.1 of the best candidate")
     head += ("not 0.1 below prior or NPE", "within two errors of the held-out score")
-    return table(head, lines)
+    return table(("what is wrong", *head), lines)
 
 
 # README -------------------------------------------------------------------------------
@@ -302,7 +345,7 @@ OF_README = {
     "prior": "prior",
     "NPE": "NPE as it was",
     "fine-tuned NPE (averaged)": "fine-tuned NPE, averaged",
-    "FMCPE (embedding)": "FMCPE (embedding)",
+    "FMCPE": "FMCPE",
     "FRISBI (distilled)": "FRISBI (distilled)",
     "RoPE": "RoPE",
     STACK: "**`stack`**",
@@ -326,7 +369,7 @@ def _readme(published: Published) -> Lines:
         "",
         *table(("", *(f"{n} labels" for n in FEW), "ACAUC, 50 labels"), lines),
         "",
-        "[All tasks, all methods](benchmarks/results/README.md), also where another is "
+        "[All tasks, all methods](docs/background/benchmark.md), also where another is "
         "better.",
     ]
 
@@ -398,26 +441,16 @@ SENSORS = {"task": "light_tunnel_sensors"}
 LINEAR = {"task": "linear_gaussian"}
 FAILURES = LINEAR | {"suite": "failures"}
 MIDDLE = {"variant": "biased_calibration"}
-TASKS = {
-    "cs": {"task": "cs"},
-    "sir": {"task": "sir"},
-    "pendulum": {"task": "pendulum"},
-    "hemodynamics": {"task": "hemodynamics"},
-    "images (stand-in)": {"task": "light_tunnel"},
-    "wind tunnel (stand-in)": {"task": "wind_tunnel"},
-    "sensors (real)": SENSORS,
-    "ocean colour (real)": {"task": "ocean_colour"},
-    "near infrared (real)": {"task": "near_infrared"},
-}
+RIGHT = {"suite": "wellspecified", "variant": "well_specified"}
+NOISY: Fields = {"suite": "labels", "size": SIZE, "options": '{"label_noise": 0.1}'}
 BLOCKS: dict[str, Callable[[Published], Lines]] = {
     "readme": _readme,
-    "what-was-run": _overview,
-    "lpp": lambda published: _all_tasks(published, lpp_text),
-    "acauc": lambda published: _all_tasks(published, acauc_text),
+    "scores": _scores,
+    "of-the-stack": _of_the_stack,
     "not-the-best": _not_the_best,
     "goals": _goals,
     "candidates": _against_candidates,
-    "costs": lambda published: _all_tasks(published, costs_text),
+    "what-was-run": _overview,
     "labels-of-a-stack": Excerpt(
         lines={
             "light tunnel's sensors, real measurements": SENSORS,
@@ -427,24 +460,22 @@ BLOCKS: dict[str, Callable[[Published], Lines]] = {
         columns={"NPE": {"method": "NPE"}}
         | {f"{n} pairs": {"method": STACK, "size": n} for n in FEW},
     ),
-    "stack-and-others": Excerpt(
-        lines=_methods("prior", "NPE", "OT-only", "RVNP", "J-NPE")
-        | _methods("fine-tuned NPE (averaged)", "FMCPE (embedding)")
-        | _methods("FRISBI (distilled)", "RoPE", "discrepancy, fine-tuned", STACK),
-        columns=TASKS,
-        sizes=FEW,
-    ),
     "hard": Excerpt(
         lines={
             "curved error": FAILURES | {"variant": "curved"},
             "heavy tails": FAILURES | {"variant": "heavy_tails"},
             "other settings, sensors (real)": SENSORS
             | {"suite": "shift", "variant": "sensor_settings"},
+            "nothing is wrong, pendulum": {"task": "pendulum"} | RIGHT,
+            "nothing is wrong, sensors": SENSORS | RIGHT,
             "middle of the prior, linear_gaussian": FAILURES | MIDDLE,
             "the same, pendulum": {"task": "pendulum", "suite": "noniid"} | MIDDLE,
             "the same, sensors (real)": SENSORS | {"suite": "noniid"} | MIDDLE,
+            "noise on 50 labels, pendulum": {"task": "pendulum"} | NOISY,
+            "noise on 50 labels, sensors (real)": SENSORS | NOISY,
         },
-        columns=_methods("prior", "RoPE", "fine-tuned NPE", STACK, GIVEN_PRIOR_STACK),
+        columns=_methods("prior", "NPE", "RoPE", "fine-tuned NPE")
+        | _methods(STACK, GIVEN_PRIOR_STACK),
         sizes=FEW,
     ),
     "dimension": Excerpt(

@@ -60,67 +60,82 @@ def test_committed_pages_are_those_of_the_tables(tmp_path: Path) -> None:
 @pytest.mark.medium
 def test_the_stack_is_compared_with_the_best_other(tmp_path: Path) -> None:
     lpps = -1.0, -1.2, -1.1
-    ours = [{"stack": lpp, "J-NPE": -1.5} for lpp in lpps]
+    ours = [{"stack": lpp, "NNPE": -1.5} for lpp in lpps]
     results = published(tmp_path, "cs", ours)
     assert BLOCKS["goals"](results)[3].endswith("over repetitions: 3 of 3")
     # Nothing is lost anywhere.
     assert len(BLOCKS["not-the-best"](results)) == 2
-    theirs = [{"stack": -1.5, "J-NPE": lpp} for lpp in lpps]
+    theirs = [{"stack": -1.5, "NNPE": lpp} for lpp in lpps]
     lines = BLOCKS["not-the-best"](published(tmp_path, "cs", theirs))
     row = line(lines, "A cs | 50")
     # 4.303 is Student's quantile of two degrees of freedom.
     gap = f"-0.40 ± {4.303 * 0.1 / 3**0.5:.2f}"
-    assert row[1:] == ["3", "-1.50", "+0.020", "J-NPE", "-1.10", gap]
+    assert row[1:] == ["3", "-1.50", "+0.020", "NNPE", "-1.10", gap]
 
 
 def test_methods_that_see_more_or_are_ours_are_counted_apart(tmp_path: Path) -> None:
-    lpp = {"stack": -1.0, "RVNP": -0.5, "discrepancy": -1.0, "J-NPE": -1.5, "NPE": -0.8}
-    goals = BLOCKS["goals"](published(tmp_path, "cs", [lpp, lpp]))
-    assert [goal.split(": ")[-1] for goal in goals[1:6]] == ["0 of 3"] * 5
-    assert "|ACAUC| of 0.020" in goals[6]
-    lpp |= {"RVNP": -1.5, "NPE": -1.5}
-    goals = BLOCKS["goals"](published(tmp_path, "cs", [lpp, lpp]))
-    counts = [goal.split(": ")[-1] for goal in goals[1:6]]
+    def counts(**lpp: float) -> list[str]:
+        goals = BLOCKS["goals"](published(tmp_path, "cs", [lpp, lpp]))
+        assert "|ACAUC| of 0.020" in goals[6]
+        return [goal.split(": ")[-1] for goal in goals[1:6]]
+
+    lpp = {"stack": -1.0, "RVNP": -0.5, "discrepancy": -1.0, "NPE": -0.8}
+    assert counts(**lpp) == ["0 of 3"] * 4 + ["3 of 3"]
     # A candidate of ours is as good, so that the stack is above all others only.
-    assert counts == ["3 of 3", "3 of 3", "0 of 3", "3 of 3", "3 of 3"]
+    lpp |= {"RVNP": -1.5, "NPE": -1.5}
+    assert counts(**lpp) == ["3 of 3", "3 of 3", "3 of 3", "3 of 3", "3 of 3"]
+    assert counts(**lpp, Regression=-0.8)[3] == "0 of 3"
 
 
 @pytest.mark.medium
 def test_the_best_has_all_repetitions_and_the_fixed_setting(tmp_path: Path) -> None:
     usual = {"NPE": -1.0, "SBI": 0.0, "RoPE": -2.0, "RoPE, other": -0.5}
-    first = usual | {"MLP": -0.1, "prior": -math.inf, "NNPE": None}
-    runs = [first, usual | {"MLP": -0.1}, usual | {"MLP": "failed"}]
-    lines = BLOCKS["lpp"](published(tmp_path, "cs", runs))
-    assert line(lines, "NPE") == ["**-1.00 ± 0.00**"]
-    assert line(lines, "MLP") == ["-0.10 ± 0.00 (1 of 3 failed)"]
-    assert line(lines, "NNPE") == ["-5.00 ± 0.00 [2]"]
-    assert line(lines, "prior") == ["-inf"]
-    assert line(lines, "RoPE") == ["-2.00 ± 0.00"]
-    assert line(lines, f"RoPE ({PAPER})") == ["-0.50 ± 0.00"]
+    first = usual | {"FMCPE": -0.1, "prior": -math.inf, "NNPE": None}
+    runs = [first, usual | {"FMCPE": -0.1}, usual | {"FMCPE": "failed"}]
+    lines = BLOCKS["scores"](published(tmp_path, "cs", runs))
+    assert line(lines, "NPE")[0] == "**-1.00**"
+    assert line(lines, "FMCPE")[0] == "-0.10 (1 of 3 failed)"
+    assert line(lines, "NNPE")[0] == "-5.00 [2]"
+    assert line(lines, "prior")[0] == "-inf"
+    assert line(lines, "RoPE")[0] == "-2.00"
+    assert line(lines, f"RoPE ({PAPER})")[0] == "-0.50"
+    # The mean |ACAUC| and seconds.
+    assert line(lines, "stack")[-2:] == ["0.020", "0"]
+
+
+def test_methods_of_other_commits_are_marked(tmp_path: Path) -> None:
+    results = published(tmp_path, "cs", [{}])
+    cells = load_suite("earlier").cells
+    old = [cell for cell in cells if (cell.method, cell.n_calibration) == ("J-NPE", 50)]
+    row = result_of(old[0], -1.0)
+    row.row["git_commit"] = "7654321"
+    Results(tmp_path / "earlier").add([row])
+    lines = BLOCKS["scores"](Published.read(results.folder))
+    names = [text.split(" | ")[0].strip("| ") for text in lines]
+    assert "J-NPE †" in names
+    assert "stack" in names
 
 
 @pytest.mark.medium
 def test_readme_shows_scores_with_their_intervals(tmp_path: Path) -> None:
-    fmcpe = "FMCPE (embedding)"
     runs = [
-        {"stack": -1.0, "RoPE": -3.0, fmcpe: -6.0},
-        {"stack": -1.2, "RoPE": None, fmcpe: -6.0},
-        {"stack": -1.1, "RoPE": None, fmcpe: "failed"},
+        {"stack": -1.0, "RoPE": -3.0, "FMCPE": -6.0},
+        {"stack": -1.2, "RoPE": None, "FMCPE": -6.0},
+        {"stack": -1.1, "RoPE": None, "FMCPE": "failed"},
     ]
     lines = BLOCKS["readme"](published(tmp_path, "light_tunnel_sensors", runs))
     stack = "-1.10 ± 0.25 (3)"  # 4.303 * 0.1 / sqrt(3)
     assert line(lines, "**`stack`**") == [stack, stack, stack, "+0.020"]
     # Of one repetition the interval is over its test observations.
     assert line(lines, "RoPE")[:2] == ["-3.00 ± 0.20 (1)"] * 2
-    assert line(lines, fmcpe)[0] == "-6.00 ± 0.00 (2; 1 failed)"
+    assert line(lines, "FMCPE")[0] == "-6.00 ± 0.00 (2; 1 failed)"
 
 
 @pytest.mark.medium
 def test_what_was_run_is_drawn_and_counted_on_a_page(tmp_path: Path) -> None:
-    results = published(tmp_path, "cs", [{"MLP": "failed"}])
-    draw_overview(results)
-    drawn = {path.name for path in tmp_path.glob("*.png")}
-    assert drawn == {"methods.png", "ranks.png"}
+    results = published(tmp_path, "cs", [{"RVNP": "failed"}])
+    draw_overview(results, tmp_path / "benchmark.png")
+    assert (tmp_path / "benchmark.png").exists()
     page = tmp_path / "page.md"
     begin, end = "<!-- results: what-was-run -->\n", "<!-- /results -->\n"
     page.write_text(f"before\n{begin}old\n{end}after\n")
@@ -128,8 +143,9 @@ def test_what_was_run_is_drawn_and_counted_on_a_page(tmp_path: Path) -> None:
     lines = page.read_text().splitlines()
     assert (lines[0], lines[-1]) == ("before", "after")
     assert "old" not in lines
-    finished, failed, missing = line(lines, "[main](main/n_calibration.png)")
-    assert failed == "4: MLP 4"
-    assert " ocean_colour " in missing
+    finished, failed, missing, commits = line(lines, "main")
+    assert failed == "1: RVNP 1"
+    assert " FMCPE (embedding) 18" in missing
+    assert commits == "1234567"
     total = len(load_suite("main").cells)
-    assert int(finished) + 4 + int(missing.split(":")[0]) == total
+    assert int(finished) + 1 + int(missing.split(":")[0]) == total
