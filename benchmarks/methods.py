@@ -18,18 +18,15 @@ from sbi_rope.baselines import (
     RNPE,
     RVNP,
     CalibrationMLP,
-    FinetunedNPE,
     JointNPE,
-    Method,
     PlainNPE,
     PriorBaseline,
     ReferenceNPE,
     Regression,
-    Training,
     TuningOnly,
 )
 from sbi_rope.density import MixturePosterior
-from sbi_rope.methods import DiscrepancyNPE
+from sbi_rope.methods import DiscrepancyNPE, FinetunedNPE, Method, Training
 from sbi_rope.methods.discrepancy_npe import Corrected
 from sbi_rope.rope import RoPE
 from sbi_rope.stacking import StackData

@@ -7,7 +7,7 @@ from typing import Any
 from sbi.neural_nets import posterior_nn
 
 from sbi_rope import CalibrationFinetuner
-from sbi_rope.baselines import Training
+from sbi_rope.methods import Training
 from sbi_rope.tasks import Task
 
 

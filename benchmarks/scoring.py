@@ -19,7 +19,8 @@ from benchmarks.methods import (
 )
 from benchmarks.store import Result
 from sbi_rope import RoPE, SinkhornCoupler
-from sbi_rope.baselines import Method, ReferenceNPE
+from sbi_rope.baselines import ReferenceNPE
+from sbi_rope.methods import Method
 from sbi_rope.metrics import evaluate
 from sbi_rope.stacking import StackedPosterior, default_candidates, stack
 

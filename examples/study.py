@@ -26,7 +26,7 @@ from sbi_rope import (
     plots,
     stack,
 )
-from sbi_rope.baselines import PriorPosterior
+from sbi_rope.density import PriorPosterior
 from sbi_rope.methods import DiscrepancyNPE
 from sbi_rope.metrics import Evaluation, evaluate
 from sbi_rope.tasks import Task

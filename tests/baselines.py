@@ -15,8 +15,7 @@ from torch import Tensor, nn
 
 import sbi_rope.baselines as methods
 from sbi_rope import CalibrationFinetuner
-from sbi_rope.baselines import Method, Training
-from sbi_rope.methods import DiscrepancyNPE
+from sbi_rope.methods import DiscrepancyNPE, FinetunedNPE, Method, Training
 from sbi_rope.methods.base import Kind
 from sbi_rope.tasks import Task, get_task
 from sbi_rope.utils.seeds import seeded
@@ -61,8 +60,8 @@ METHODS: dict[str, Entry] = {
     "joint_npe": Entry(methods.JointNPE, {"training": SHORT}),
     "calibration_mlp": Entry(methods.CalibrationMLP, {"training": SHORT}),
     "regression": Entry(methods.Regression),
-    "finetuned_npe": Entry(methods.FinetunedNPE, BRIEF),
-    "finetuned_npe_averaged": Entry(methods.FinetunedNPE, BRIEF | {"num_holdouts": 3}),
+    "finetuned_npe": Entry(FinetunedNPE, BRIEF),
+    "finetuned_npe_averaged": Entry(FinetunedNPE, BRIEF | {"num_holdouts": 3}),
     "discrepancy_embedding": Entry(DiscrepancyNPE, CORRECTION),
     "discrepancy_input": Entry(DiscrepancyNPE, CORRECTION | {"space": "input"}),
     "fmcpe": Entry(methods.FMCPE, BRIEF),

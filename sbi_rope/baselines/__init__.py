@@ -17,8 +17,6 @@ from sbi_rope.baselines.regression import Regression
 from sbi_rope.baselines.rnpe import RNPE
 from sbi_rope.baselines.rope_parts import OTOnly, TuningOnly
 from sbi_rope.baselines.rvnp import RVNP
-from sbi_rope.density import PriorPosterior
-from sbi_rope.methods import FinetunedNPE, Method, Training
 
 __all__ = [
     "FMCPE",
@@ -29,16 +27,12 @@ __all__ = [
     "RNPE",
     "RVNP",
     "CalibrationMLP",
-    "FinetunedNPE",
     "JointNPE",
-    "Method",
     "OTOnly",
     "PlainNPE",
     "PriorBaseline",
-    "PriorPosterior",
     "ReferenceNPE",
     "Regression",
     "SpikeAndSlab",
-    "Training",
     "TuningOnly",
 ]

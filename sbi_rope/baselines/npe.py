@@ -54,7 +54,7 @@ class PlainNPE(Method):
 
     Example:
         >>> from sbi.utils import BoxUniform
-        >>> from sbi_rope.baselines import Training
+        >>> from sbi_rope.methods import Training
         >>> prior = BoxUniform(torch.zeros(1), torch.ones(1))
         >>> theta = prior.sample((200,))
         >>> method = PlainNPE(prior, "mdn", npe_training=Training(max_num_epochs=1))

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.distributions import Gamma, Independent
 
 from sbi_rope import RoPE
-from sbi_rope.baselines import FinetunedNPE
+from sbi_rope.methods import FinetunedNPE
 from sbi_rope.rope.finetuning import FINETUNING
 from sbi_rope.stacking import default_candidates, stack
 from sbi_rope.utils.errors import RoPEWarning

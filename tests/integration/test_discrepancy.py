@@ -11,8 +11,9 @@ from sbi.neural_nets import posterior_nn
 from scipy import stats
 from torch import Tensor
 
-from sbi_rope.baselines import PlainNPE, Training
+from sbi_rope.baselines import PlainNPE
 from sbi_rope.discrepancy import DiscrepancyDraws, DiscrepancyModel
+from sbi_rope.methods import Training
 from sbi_rope.methods.discrepancy_npe import DiscrepancyNPE
 from sbi_rope.utils.seeds import seeded
 from tests import gaussian

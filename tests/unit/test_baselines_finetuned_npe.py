@@ -9,10 +9,10 @@ import torch
 from sbi.neural_nets import posterior_nn
 from torch import Tensor, nn
 
-from sbi_rope.baselines import FinetunedNPE, PlainNPE, Training
+from sbi_rope.baselines import PlainNPE
 from sbi_rope.baselines.networks import shuffled
 from sbi_rope.data.pairs import Pairs, epochs_on_pairs, split_pairs
-from sbi_rope.methods import DiscrepancyNPE
+from sbi_rope.methods import DiscrepancyNPE, FinetunedNPE, Training
 from sbi_rope.tasks import get_task
 from sbi_rope.training.fit import fit
 from sbi_rope.utils.seeds import seeded

@@ -7,8 +7,9 @@ import torch
 from sbi.utils import BoxUniform
 from torch import nn
 
-from sbi_rope.baselines import FMCPE, Training
+from sbi_rope.baselines import FMCPE
 from sbi_rope.baselines.flow_matching import Unbounded, VelocityField
+from sbi_rope.methods import Training
 from tests import gaussian, problems
 from tests.baselines import log_prob, sample, train
 

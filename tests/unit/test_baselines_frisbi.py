@@ -6,8 +6,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from sbi_rope.baselines import FRISBI, Training
+from sbi_rope.baselines import FRISBI
 from sbi_rope.baselines.frisbi import Aligned
+from sbi_rope.methods import Training
 from tests import gaussian, problems
 from tests.baselines import train
 

@@ -10,7 +10,7 @@ from sbi.utils import BoxUniform
 from torch import Tensor, nn
 from torch.distributions import Independent, MultivariateNormal, Normal
 
-from sbi_rope.baselines import HVAE, PlainNPE, Training
+from sbi_rope.baselines import HVAE, PlainNPE
 from sbi_rope.baselines.hvae import OverLatents
 from sbi_rope.baselines.hvae_model import (
     ConditionalUNet,
@@ -18,6 +18,7 @@ from sbi_rope.baselines.hvae_model import (
     HybridVAE,
     reparametrised_sample,
 )
+from sbi_rope.methods import Training
 from sbi_rope.npe.sbi import headless
 from sbi_rope.tasks import get_task
 from tests.baselines import log_prob, swing, train

@@ -10,8 +10,9 @@ import torch
 from sbi.neural_nets import posterior_nn
 from torch import Tensor
 
-from sbi_rope.baselines import NNPE, PlainNPE, SpikeAndSlab, Training
+from sbi_rope.baselines import NNPE, PlainNPE, SpikeAndSlab
 from sbi_rope.baselines.statistics import SoftClip
+from sbi_rope.methods import Training
 from sbi_rope.npe.sbi import embedding_of, estimator_of
 from tests import problems
 from tests.baselines import log_prob, train

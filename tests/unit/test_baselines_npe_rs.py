@@ -8,8 +8,9 @@ import torch
 from sbi.neural_nets import posterior_nn
 from torch import Tensor, nn
 
-from sbi_rope.baselines import NPERS, PlainNPE, Training
+from sbi_rope.baselines import NPERS, PlainNPE
 from sbi_rope.baselines.npe_rs import squared_mmd
+from sbi_rope.methods import Training
 from sbi_rope.npe.sbi import embed, embedding_of
 from sbi_rope.utils.errors import RoPEWarning
 from tests.baselines import log_prob, train

@@ -8,9 +8,10 @@ import pytest
 import torch
 from torch.distributions import Cauchy, MultivariateNormal, Normal
 
-from sbi_rope.baselines import RNPE, SpikeAndSlab, Training
+from sbi_rope.baselines import RNPE, SpikeAndSlab
 from sbi_rope.baselines.error_model import denoise, split_r_hat
 from sbi_rope.baselines.rnpe import fit_marginal
+from sbi_rope.methods import Training
 from sbi_rope.metrics import evaluate
 from sbi_rope.utils.errors import RoPEWarning
 from tests import gaussian

@@ -15,7 +15,7 @@ from torch.distributions import (
     Normal,
 )
 
-from sbi_rope.baselines import RVNP, Training
+from sbi_rope.baselines import RVNP
 from sbi_rope.baselines.rvnp import (
     Bound,
     ErrorModel,
@@ -23,6 +23,7 @@ from sbi_rope.baselines.rvnp import (
     gaussians_of,
     log_likelihood,
 )
+from sbi_rope.methods import Training
 from sbi_rope.npe.sbi import estimator_of
 from tests import gaussian
 from tests.baselines import log_prob, train

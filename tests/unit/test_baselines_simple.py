@@ -12,16 +12,14 @@ from torch.distributions import Distribution, Independent, Normal
 from sbi_rope import CalibrationFinetuner, RoPE, SinkhornCoupler
 from sbi_rope.baselines import (
     CalibrationMLP,
-    FinetunedNPE,
     JointNPE,
-    Method,
     OTOnly,
     PlainNPE,
     ReferenceNPE,
-    Training,
     TuningOnly,
 )
 from sbi_rope.baselines.calibration_mlp import DiagonalGaussian
+from sbi_rope.methods import FinetunedNPE, Method, Training
 from sbi_rope.tasks import get_task
 from tests import problems
 from tests.baselines import log_prob, train

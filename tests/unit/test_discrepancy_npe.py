@@ -9,13 +9,12 @@ from sbi.inference import DirectPosterior, VectorFieldPosterior
 from sbi.neural_nets import posterior_nn
 from torch import Tensor, nn
 
-from sbi_rope.baselines import Training
 from sbi_rope.data.pairs import Pairs
 from sbi_rope.data.simulate import Moments
 from sbi_rope.density import Flow
 from sbi_rope.discrepancy import DiscrepancyModel
 from sbi_rope.discrepancy.correction import correct_flow, fit_discrepancy
-from sbi_rope.methods import DiscrepancyNPE
+from sbi_rope.methods import DiscrepancyNPE, Training
 from sbi_rope.npe.sbi import embedding_of, estimator_of
 from sbi_rope.npe.standardisation import Standardisation
 from sbi_rope.utils.errors import InvalidInputError, NotReadyError

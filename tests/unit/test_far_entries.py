@@ -11,8 +11,8 @@ from sbi.utils.sbiutils import Standardize
 from torch import Tensor, nn
 
 from sbi_rope import CalibrationFinetuner, RoPE, diagnose, stack
-from sbi_rope.baselines import FinetunedNPE, Training
 from sbi_rope.density import MixturePosterior, density_of
+from sbi_rope.methods import FinetunedNPE, Training
 from sbi_rope.npe.standardisation import deviations
 from sbi_rope.utils.errors import InvalidInputError, RoPEWarning
 from tests import problems

@@ -11,7 +11,7 @@ import torch
 from sbi.inference import NPE
 from torch import Tensor
 
-from sbi_rope.baselines import Training
+from sbi_rope.methods import Training
 from sbi_rope.methods.training import (
     SimulationTrainer,
     estimator_builder,
