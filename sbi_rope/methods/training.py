@@ -51,6 +51,8 @@ class SimulationTrainer(NPE):
         theta = data.tensors[0]
         if len(theta.unique(dim=0)) < len(theta):
             rows = split_pairs(theta, validation_fraction)
+            # sbi standardises by what is trained on.
+            self.train_indices, self.val_indices = rows
             train, held_out = (SubsetRandomSampler(some.tolist()) for some in rows)
             if size := len(held_out):
                 batch_size = min(training_batch_size, len(train))

@@ -81,3 +81,19 @@ def test_recordings_of_a_person_are_held_out_together(people: Any) -> None:
     # None is left out of the hold-out, and less than a batch of the others.
     assert 1 <= len(rows[1]) < len(theta) / 2
     assert 0 <= len(theta) - len(rows[1]) - len(rows[0]) < 10
+
+
+def test_a_network_is_standardised_by_the_people_it_is_trained_on() -> None:
+    seen: list[Tensor] = []
+
+    def build(theta: Tensor, x: Tensor) -> Any:
+        seen.append(theta)
+        return estimator_builder("mdn")(theta, x)
+
+    theta = box(2).sample((12,)).repeat_interleave(6, dim=0)
+    train_on_simulations(
+        *(box(2), build, theta, simulate(theta)),
+        training=Training(max_num_epochs=1, training_batch_size=20),
+        show_progress_bars=False,
+    )
+    assert len(seen[0].unique(dim=0)) == 11  # a tenth of the people is held out
