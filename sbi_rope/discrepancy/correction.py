@@ -52,7 +52,7 @@ NUM_COMPARED = 1920
 # follows only if the loss still falls by so many nats in the last quarter of the first.
 # Chosen on calibration data, see benchmarks/choices.md.
 COURSES = Courses(min_gain=0.01)
-IN_A_STACK = Courses(min_gain=0.01, min_fall=0.3, max_num=2)
+IN_A_STACK = Courses(min_gain=0.01, min_fall=0.15, max_num=2)
 
 
 def network_of(estimator: ConditionalEstimator, space: Space) -> nn.Module:
