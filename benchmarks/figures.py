@@ -102,7 +102,7 @@ def curves(axis: str, rows: pd.DataFrame, *, max_columns: int = MAX_COLUMNS) -> 
     bands = math.ceil(len(groups) / max_columns)
     columns = math.ceil(len(groups) / bands)
     figure = empty_figure(3.1 * columns + 1.9, 5.4 * bands)
-    axes = figure.subplots(2 * bands, columns, squeeze=False, sharex="col")
+    axes = figure.subplots(2 * bands, columns, squeeze=False)
     # Side by side, as if nothing was wrapped.
     axes = np.concatenate(np.split(axes, bands), axis=1)
     for part in axes[:, len(groups) :].flat:
@@ -116,7 +116,7 @@ def curves(axis: str, rows: pd.DataFrame, *, max_columns: int = MAX_COLUMNS) -> 
         _panel(axes[1, column], axis, group, "acauc", seen)
         axes[1, column].axhline(0, color="0.6", lw=0.8)
         axes[1, column].set_xlabel(axis.replace("_", " "))
-        axes[1, column].tick_params(labelbottom=True)
+        axes[0, column].tick_params(labelbottom=False)
         for part in axes[:, column]:
             hide_frame(part)
     axes[0, 0].set_ylabel("LPP, in prior sd")

@@ -162,10 +162,11 @@ def _scores(published: Published) -> Lines:
     """
     usual = num_repetitions([published.rows["main"]])
     rows = {name: published.select(name) for name in METHODS}
-    run = {*rows[STACK]["git_commit"]}
     # It does not compete, or one of two would be chosen by the reported score.
     rows[f"RoPE ({PAPER})"] = published.select("RoPE", setting=PAPER)
-    rows = {name: part for name, part in rows.items() if len(part)}
+    # Others are in the tables of `earlier` only.
+    of_main = {name: part[part["suite"] == "main"] for name, part in rows.items()}
+    rows = {name: part for name, part in of_main.items() if len(part)}
     columns = {}
     for task in LETTERS:
         parts = {name: part[part["task"] == task] for name, part in rows.items()}
@@ -174,13 +175,12 @@ def _scores(published: Published) -> Lines:
             columns[task][best] = f"**{columns[task][best]}**"
     lines = []
     for name, part in rows.items():
-        mark = " †" if {*part["git_commit"]} - run else ""
         known = finished(part)
         by_task = (known["seconds_train"] + known["seconds_couple"]).groupby(
             known["task"]
         )
         costs = f"{known['acauc'].abs().mean():.3f}", f"{by_task.mean().median():.0f}"
-        lines.append([name + mark, *(columns[task][name] for task in LETTERS), *costs])
+        lines.append([name, *(columns[task][name] for task in LETTERS), *costs])
     head = ("", *map(published.name, LETTERS), "\\|ACAUC\\|", "seconds")
     return table(head, lines)
 
@@ -230,8 +230,13 @@ def _of_the_stack(published: Published) -> Lines:
 
 
 def _not_the_best(published: Published) -> Lines:
-    """Return where another method is above the stack by more than is near."""
+    """Return where another method is above the stack by more than is near.
+
+    Methods that were not run again, †, are among them.
+    """
     lines = []
+    earlier = {cell.method for cell in published.suites["earlier"].cells}
+    earlier -= {cell.method for cell in published.suites["main"].cells}
     for one in compare(finished(published.main)):
         best = one.best()
         assert best is not None
@@ -246,7 +251,7 @@ def _not_the_best(published: Published) -> Lines:
                 *(one.size, len(gap)),
                 f"{lpp:.2f}",
                 f"{own['acauc'].mean():+.3f}",
-                best,
+                best + " †" * (best in earlier),
                 f"{lpp - gap.mean():.2f}",
                 f"{gap.mean():+.2f}" + (f" ± {width:.2f}" if width < np.inf else ""),
             ]

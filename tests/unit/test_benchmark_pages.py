@@ -103,17 +103,16 @@ def test_the_best_has_all_repetitions_and_the_fixed_setting(tmp_path: Path) -> N
     assert line(lines, "stack")[-2:] == ["0.020", "0"]
 
 
-def test_methods_of_other_commits_are_marked(tmp_path: Path) -> None:
+def test_methods_that_were_not_run_again_compete_but_are_not_shown(
+    tmp_path: Path,
+) -> None:
     results = published(tmp_path, "cs", [{}])
     cells = load_suite("earlier").cells
     old = [cell for cell in cells if (cell.method, cell.n_calibration) == ("J-NPE", 50)]
-    row = result_of(old[0], -1.0)
-    row.row["git_commit"] = "7654321"
-    Results(tmp_path / "earlier").add([row])
-    lines = BLOCKS["scores"](Published.read(results.folder))
-    names = [text.split(" | ")[0].strip("| ") for text in lines]
-    assert "J-NPE †" in names
-    assert "stack" in names
+    Results(tmp_path / "earlier").add([result_of(old[0], -1.0)])
+    results = Published.read(results.folder)
+    assert "J-NPE" not in "".join(BLOCKS["scores"](results))
+    assert line(BLOCKS["not-the-best"](results), "A cs | 50")[4] == "J-NPE †"
 
 
 @pytest.mark.medium
