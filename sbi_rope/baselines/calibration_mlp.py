@@ -120,7 +120,7 @@ class CalibrationMLP(Method):
         | https://arxiv.org/abs/2405.08719
 
     Args:
-        prior, device: See :class:`Method`.
+        prior, device: See :class:`~sbi_rope.methods.Method`.
         density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns; only its
             embedding net and its standardisation of x are used.
         training: At most 2000 epochs in batches of 100 at a learning rate of 3e-4, and

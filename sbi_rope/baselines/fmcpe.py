@@ -66,7 +66,8 @@ class FMCPE(Method):
         | https://arxiv.org/abs/2509.23385
 
     Args:
-        prior, density_estimator, npe_training, simulator, device: See :class:`Method`.
+        prior, density_estimator, npe_training, simulator, device: See
+            :class:`~sbi_rope.methods.Method`.
         space: Where observations are mapped to simulations: as they are (``"input"``,
             as published), or by their embedding, h(x_o) to h(x).
         noise: :math:`\epsilon`, in standard deviations of the simulations. The paper

@@ -63,7 +63,8 @@ class FRISBI(Method):
         | https://arxiv.org/abs/2508.15593
 
     Args:
-        prior, density_estimator, npe_training, simulator, device: See :class:`Method`.
+        prior, density_estimator, npe_training, simulator, device: See
+            :class:`~sbi_rope.methods.Method`.
         gamma: :math:`\gamma`, in units of the mean squared difference of embeddings.
         distilled: Whether the posterior is :math:`q_\phi`.
         training: How g is trained, in batches of observations, each with all pairs; 100

@@ -65,7 +65,7 @@ class HVAE(Method):
         | https://arxiv.org/abs/2405.08719
 
     Args:
-        prior, npe_training, device: See :class:`Method`.
+        prior, npe_training, device: See :class:`~sbi_rope.methods.Method`.
         density_estimator: A name, or what sbi's ``posterior_nn(...)`` returns; a
             normalizing flow of nflows or zuko.
         physics: f, from theta ``(n, d)`` to ``(n, *event)``: the simulator without

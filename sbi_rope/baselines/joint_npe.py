@@ -35,7 +35,7 @@ class JointNPE(Method):
         | https://arxiv.org/abs/2405.08719
 
     Args:
-        prior, density_estimator, device: See :class:`Method`.
+        prior, density_estimator, device: See :class:`~sbi_rope.methods.Method`.
         training: How it is trained; the held-out share is that of the calibration
             pairs. ``Training(validation_fraction=0.2)`` if None.
     """

@@ -43,7 +43,8 @@ class NNPE(Method):
         | https://arxiv.org/abs/2210.06564
 
     Args:
-        prior, density_estimator, npe_training, device: See :class:`Method`.
+        prior, density_estimator, npe_training, device: See
+            :class:`~sbi_rope.methods.Method`.
         noise_on: Where the noise goes: ``"embedding"`` or ``"input"``.
         error_model: The noise; ``SpikeAndSlab()`` if None.
         training: How training goes on with noise; ``Training()`` if None.

@@ -25,7 +25,7 @@ class PriorBaseline(Method):
     posterior probability has learnt less than nothing.
 
     Args:
-        prior, device: See :class:`Method`.
+        prior, device: See :class:`~sbi_rope.methods.Method`.
     """
 
     sees = frozenset()
@@ -50,7 +50,8 @@ class PlainNPE(Method):
         | https://arxiv.org/abs/1905.07488
 
     Args:
-        prior, density_estimator, npe_training, device: See :class:`Method`.
+        prior, density_estimator, npe_training, device: See
+            :class:`~sbi_rope.methods.Method`.
 
     Example:
         >>> from sbi.utils import BoxUniform

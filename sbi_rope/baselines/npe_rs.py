@@ -82,8 +82,9 @@ class NPERS(Method):
         | https://arxiv.org/abs/2305.15871
 
     Args:
-        prior, density_estimator, device: See :class:`Method`. The estimator should have
-            an embedding net.
+        prior, density_estimator, device: See
+            :class:`~sbi_rope.methods.Method`. The estimator should have an
+            embedding net.
         regularisation: The weight :math:`\beta`; at 0 the method is NPE.
         training: How it is trained; ``Training()`` if None.
     """

@@ -18,7 +18,7 @@ class Regression(Method):
         | http://gaussianprocess.org/gpml, sections 2.2, 5.4.1 and 5.4.2
 
     Args:
-        prior, device: See :class:`Method`.
+        prior, device: See :class:`~sbi_rope.methods.Method`.
 
     Raises:
         InvalidInputError: In ``train``, if a parameter is the same in all pairs.

@@ -127,7 +127,8 @@ class RNPE(Method):
         | https://arxiv.org/abs/2210.06564
 
     Args:
-        prior, density_estimator, npe_training, device: See :class:`Method`.
+        prior, density_estimator, npe_training, device: See
+            :class:`~sbi_rope.methods.Method`.
         noise_on: What the statistics are: the ``"embedding"`` of NPE, or the
             ``"input"``, whose shape must be ``(l,)`` then.
         error_model: The errors; ``SpikeAndSlab()`` if None.

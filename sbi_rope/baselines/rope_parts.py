@@ -27,7 +27,8 @@ class TuningOnly(Method):
     it is sharp, and nothing tempers it where they do not.
 
     Args:
-        prior, density_estimator, npe_training, simulator, device: See :class:`Method`.
+        prior, density_estimator, npe_training, simulator, device: See
+            :class:`~sbi_rope.methods.Method`.
         finetuner: Settings of the fine-tuning; ``CalibrationFinetuner()`` if None.
     """
 
@@ -69,7 +70,8 @@ class OTOnly(Method):
     the prior is right and that h orders real observations as it orders simulations.
 
     Args:
-        prior, density_estimator, npe_training, simulator, device: See :class:`Method`.
+        prior, density_estimator, npe_training, simulator, device: See
+            :class:`~sbi_rope.methods.Method`.
         coupler: Settings of the transport; ``SinkhornCoupler()`` if None.
         num_simulations: n_s; as many as there are observations, at least 1000, if None.
     """

@@ -74,7 +74,8 @@ class RVNP(Method):
         | https://arxiv.org/abs/2509.05724
 
     Args:
-        prior, density_estimator, npe_training, device: See :class:`Method`.
+        prior, density_estimator, npe_training, device: See
+            :class:`~sbi_rope.methods.Method`.
         noise_on: What the statistics are: the ``"embedding"`` of NPE, which is kept as
             it is, or the ``"input"``, whose shape must be ``(l,)`` then.
         shift: Whether errors have an offset, :math:`\mu + \mu(\theta)`.
