@@ -32,7 +32,6 @@ from benchmarks.published import (
     finished,
     half_width,
     mean,
-    num_repetitions,
 )
 from sbi_rope.utils.files import write_atomically
 
@@ -97,25 +96,20 @@ def table(head: Sequence[object], lines: Iterable[Iterable[object]]) -> Lines:
     return [first, f"|{'|'.join([' --- '] * len(head))}|", *others]
 
 
-def entry(
-    rows: pd.DataFrame, text: Callable[[pd.DataFrame], str], out_of: int | None = None
-) -> str:
-    """Return scores as text, with what failed.
+def entry(rows: pd.DataFrame, out_of: int) -> str:
+    """Return the mean LPP over repetitions, and what failed or has not converged.
 
-    Args:
-        rows: One a repetition.
-        text: Makes a text of those that were finished.
-        out_of: The number of repetitions of what it stands beside. If there are fewer
-            rows, the entry says of how many it is.
+    If there are fewer than ``out_of`` rows, the entry says how many.
     """
     scored = finished(rows)
     if not len(scored):
         return "failed" if len(rows) else MISSING
     failed = len(rows) - len(scored)
-    fewer = f" [{len(rows)}]" if out_of is not None and len(rows) < out_of else ""
-    return (
-        text(scored) + fewer + (f" ({failed} of {len(rows)} failed)" if failed else "")
-    )
+    # Without the sign of -0.00.
+    text = f"{round(mean(rows) or 0.0, 2) + 0.0:.2f}"
+    text += "" if scored["converged"].all() else " (not converged)"
+    text += f" [{len(rows)}]" if len(rows) < out_of else ""
+    return text + (f" ({failed} of {len(rows)} failed)" if failed else "")
 
 
 # What was run, and all tasks of `main` ------------------------------------------------
@@ -161,7 +155,7 @@ def _scores(published: Published) -> Lines:
     The last columns are the mean \|ACAUC\| over tasks and repetitions, and the median
     over tasks of the seconds beside NPE's own training.
     """
-    usual = num_repetitions([published.rows["main"]])
+    usual = published.num_repetitions
     rows = {name: published.select(name) for name in METHODS}
     # It does not compete, or one of two would be chosen by the reported score.
     rows[f"RoPE ({PAPER})"] = published.select("RoPE", setting=PAPER)
@@ -171,7 +165,7 @@ def _scores(published: Published) -> Lines:
     columns = {}
     for task in LETTERS:
         parts = {name: part[part["task"] == task] for name, part in rows.items()}
-        columns[task] = {name: entry(part, _lpp, usual) for name, part in parts.items()}
+        columns[task] = {name: entry(part, usual) for name, part in parts.items()}
         if best := _best(parts, usual):
             columns[task][best] = f"**{columns[task][best]}**"
     lines = []
@@ -184,11 +178,6 @@ def _scores(published: Published) -> Lines:
         lines.append([name, *(columns[task][name] for task in LETTERS), *costs])
     head = ("", *map(published.name, LETTERS), "\\|ACAUC\\|", "seconds")
     return table(head, lines)
-
-
-def _lpp(rows: pd.DataFrame) -> str:
-    text = _mean_text(rows)
-    return text + ("" if rows["converged"].all() else " (not converged)")
 
 
 def _best(rows: Mapping[str, pd.DataFrame], repetitions: int) -> str | None:
@@ -414,7 +403,7 @@ class Excerpt:
 
     def __call__(self, published: Published) -> Lines:
         """Return the table in Markdown."""
-        usual = num_repetitions([published.rows["main"]])
+        usual = published.num_repetitions
         columns = {}
         for name, column in self.columns.items():
             entries = [
@@ -431,12 +420,7 @@ class Excerpt:
         # Once, if it needs no pairs or was not run at all.
         if all(part.index.equals(parts[0].index) for part in parts):
             parts = parts[:1]
-        return " / ".join(entry(part, _mean_text, usual) for part in parts)
-
-
-def _mean_text(rows: pd.DataFrame) -> str:
-    # Without the sign of -0.00.
-    return f"{round(mean(rows) or 0.0, 2) + 0.0:.2f}"
+        return " / ".join(entry(part, usual) for part in parts)
 
 
 def _methods(*names: str) -> dict[str, Fields]:

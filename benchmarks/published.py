@@ -1,6 +1,5 @@
 """Committed results, as the pages and pictures select and compare them."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -93,6 +92,11 @@ class Published:
         return rows[chosen & _with_setting(rows, setting)]
 
     @property
+    def num_repetitions(self) -> int:
+        """Repetitions of which `main` has rows."""
+        return self.rows["main"]["repetition"].nunique()
+
+    @property
     def main(self) -> pd.DataFrame:
         """What was run in the suite `main`, with one setting of the couplings."""
         rows = known(self.rows["main"])
@@ -119,11 +123,6 @@ def known(rows: pd.DataFrame) -> pd.DataFrame:
 def finished(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows that have scores."""
     return rows[rows["status"] == "finished"].infer_objects()
-
-
-def num_repetitions(parts: Iterable[pd.DataFrame]) -> int:
-    """Return the number of repetitions of which there are rows."""
-    return len({repetition for part in parts for repetition in part["repetition"]})
 
 
 def mean(rows: pd.DataFrame, column: str = "lpp_z") -> float | None:
