@@ -8,7 +8,7 @@
 `run` keeps each result in `OUT/SUITE` as soon as it is there, and computes only what is
 missing; `--retry` also what failed, and `--again` also what another version of the code
 has made. It ends with status 1 if a cell failed. `status` counts cells. `summary`
-writes the tables of README and of pages of docs, and draws their pictures. With
+writes the tables of README and of pages of docs, and draws their picture. With
 `--out benchmarks/results` it goes on from the committed results.
 """
 
@@ -57,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     run.add_argument("--retry", action="store_true", help="also what failed")
     status = commands.add_parser("status", help="count cells")
     status.set_defaults(command=_status)
-    summary = commands.add_parser("summary", help="write all tables and pictures")
+    summary = commands.add_parser("summary", help="write the pages' tables")
     summary.set_defaults(command=_summary)
     for command, out in (
         (run, "results/benchmark"),
@@ -110,9 +110,6 @@ def _summary(args: argparse.Namespace) -> int:
     published, pages = Published.read(args.out), pages_with_blocks(ROOT)
     write_pages(published, pages)
     draw_overview(published, ROOT / "docs/pictures/benchmark.png")
-    for name, suite in published.suites.items():
-        if name not in ("main", "earlier"):
-            draw_suite(suite, published.rows[name], args.out / name)
     print(f"Written: {', '.join(map(str, pages))}")
     return 0
 
