@@ -69,7 +69,6 @@ class Entry:
         pairs: Whether it sees calibration pairs.
         observations: Whether it sees the test observations, without their labels.
         couples: Whether it has gamma and tau.
-        ours: Whether it is of this package alone: no paper describes it.
     """
 
     style: tuple[str, str, str | None]
@@ -77,7 +76,6 @@ class Entry:
     pairs: bool = False
     observations: bool = False
     couples: bool = False
-    ours: bool = False
 
 
 # How methods are constructed ----------------------------------------------------------
@@ -262,32 +260,27 @@ METHODS: dict[str, Entry] = {
     "discrepancy": Entry(
         style=("#882255", "-", "h"),
         pairs=True,
-        ours=True,
         build=_discrepancy("embedding"),
     ),
     # It corrects x itself, which has to be short.
     "discrepancy (input)": Entry(
         style=("#882255", "--", "h"),
         pairs=True,
-        ours=True,
         build=_discrepancy("input"),
     ),
     "discrepancy (tuned)": Entry(
         style=("#882255", "-.", "h"),
         pairs=True,
-        ours=True,
         build=_discrepancy("embedding", kind=_Tuned),
     ),
     "discrepancy, prior learned": Entry(
         style=("#882255", ":", "h"),
         pairs=True,
-        ours=True,
         build=_discrepancy("embedding", learn_prior=True),
     ),
     "discrepancy, fine-tuned": Entry(
         style=("#AA4499", "-", "p"),
         pairs=True,
-        ours=True,
         build=_then_finetuned,
     ),
     "FMCPE": Entry(

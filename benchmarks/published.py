@@ -142,18 +142,14 @@ class Comparison(NamedTuple):
     rows: pd.DataFrame
     gaps: dict[str, pd.Series]
 
-    def best(self, *, ours: bool = True, unlabelled: bool = True) -> str | None:
+    def best(self, *, unlabelled: bool = True) -> str | None:
         """Return the method that it is least above; None if there is no other.
 
         Args:
-            ours: Whether methods of this package are among the others.
-            unlabelled: Whether those that see the test observations are.
+            unlabelled: Whether those that see the test observations are among them.
         """
         others = [
-            name
-            for name in self.gaps
-            if (ours or not METHODS[name].ours)
-            and (unlabelled or not METHODS[name].observations)
+            name for name in self.gaps if unlabelled or not METHODS[name].observations
         ]
         return min(others, key=self.gap, default=None)
 
@@ -164,10 +160,6 @@ class Comparison(NamedTuple):
     def is_near(self, name: str) -> bool:
         """Tell whether it is above a method, or hardly below it."""
         return self.gap(name) >= -NEAR
-
-    def is_above(self, name: str) -> bool:
-        """Tell whether it is above a method beyond the interval over repetitions."""
-        return self.gap(name) > half_width(self.gaps[name].to_numpy())
 
 
 def compare(rows: pd.DataFrame, method: str = STACK) -> list[Comparison]:
