@@ -80,7 +80,8 @@ def test_held_out_rows_change_nothing_that_scores_them(
             [log_probs(one) for one in fitted(candidate, some, versions)]
             for some in (data_of(rope), poisoned(data, data.folds[fold]))
         )
-        assert all(map(torch.equal, before, after))
+        # Some processors round by where rows lie in memory. What leaks is not finite.
+        torch.testing.assert_close(after, before, rtol=1e-5, atol=1e-5)
         assert before[0].isfinite().any()
 
 
