@@ -454,7 +454,7 @@ BLOCKS: dict[str, Callable[[Published], Lines]] = {
         | {
             f"linear_gaussian, {dim} parameters, 50 pairs": LINEAR
             | {"suite": "dimension", "size": SIZE, "options": f'{{"dim": {dim}}}'}
-            for dim in (5, 10, 25)
+            for dim in (10, 25)
         },
         columns=_methods("prior", "NPE", "RoPE", "fine-tuned NPE")
         | _methods(STACK, GIVEN_PRIOR_STACK),

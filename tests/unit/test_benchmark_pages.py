@@ -147,5 +147,5 @@ def test_what_was_run_is_drawn_and_counted_on_a_page(tmp_path: Path) -> None:
     ).split("; ")
     assert failed == "failed: RVNP 1"
     counts = [int(text.rsplit(" ", 1)[1]) for text in missing.split(", ")]
-    assert "FMCPE (embedding) 18" in missing
+    assert "FMCPE 87" in missing
     assert done == f"- main: {len(cells) - 1 - sum(counts)} of {len(cells)} cells"
