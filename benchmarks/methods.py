@@ -39,20 +39,14 @@ STATISTICS = ("cs", "sir", "linear_gaussian", "ocean_colour")
 MAX_STATISTICS = 10
 # With more entries than these, x itself is no list of summaries to be corrected.
 MAX_SUMMARIES = 20
-# FMCPE maps x itself, as published. Where that takes hours, it maps h(x).
+# With more entries than these, FMCPE maps h(x): x itself, as published, takes hours.
 MAX_MAPPED = 200
 # Channels of HVAE's first layer: an eighth of the paper's, for CPUs.
 HVAE_WIDTH = 8
 # Networks that a fine-tuned discrepancy averages over.
 NUM_HOLDOUTS = 5
 # Where there is no simulator, they look simulations up among the stored ones.
-LOOK_UP = (
-    "FMCPE",
-    "FRISBI",
-    "FRISBI (distilled)",
-    "OT-only",
-    "tuning-only",
-)
+LOOK_UP = ("FMCPE", "FRISBI", "FRISBI (distilled)", "OT-only", "tuning-only")
 # Of the pairs alone; of candidates that keep NPE's prior; and with a candidate that
 # learns from the test set without its labels.
 STACK, GIVEN_PRIOR_STACK = "stack", "stack, given prior"
